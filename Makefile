@@ -18,7 +18,7 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 	@$(BIN)/droguekit demo --out out/demo
 	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
 
-docs: ## build the documentation into out/docs (installs mkdocs-material)
+docs: ## build the documentation into out/docs (installs mkdocs-material and mkdocstrings)
 	@scripts/setup docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "docs: open $(CURDIR)/out/docs/index.html"
@@ -34,7 +34,7 @@ test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
 	@$(BIN)/python -m pytest -m "slow and not torture"
 
-test-readers: setup ## read the exports with datumaro, evo, FiftyOne, Label Studio's SDK and ultralytics (installs them under out/readers)
+test-readers: setup ## read the exports with datasets, datumaro, evo, FiftyOne, Label Studio's SDK and ultralytics (installs them under out/readers)
 	@scripts/readers
 
 torture: setup ## kill a run of 200 pairs 50 times, and compare the result with an undisturbed run (minutes)

@@ -110,11 +110,13 @@ class DrogueParameters(FrozenModel):
         marker_reflectance_rgb: diffuse reflectance in linear Rec. 709.
         marker_luminance_cd_m2: luminance of self-lit markers, 0 for painted ones. [cd/m2]
         marker_emission_rgb: colour of self-lit markers; scaled so that its luminance is 1.
-        face_reflectance_rgb, canopy_reflectance_rgb, structure_reflectance_rgb: of face and rim, of the drag canopy
-            (cloth, leaves or cone), of ribs, coupling and hose.
+        face_reflectance_rgb: of face and rim.
+        canopy_reflectance_rgb: of the drag canopy: cloth, leaves or cone.
+        structure_reflectance_rgb: of ribs, coupling and hose.
         hub: the hub feature, or none.
         rib_count: struts between rim and coupling; leaves or straps of a body that has these.
-        coupling_radius_m, coupling_length_m: the body behind the hub face. [m]
+        coupling_radius_m: of the body behind the hub face. [m]
+        coupling_length_m: of the body behind the hub face. [m]
         hose_radius_m: [m]
         body_mesh: a mesh instead of canopy, ribs and coupling, or none; its pixels count as coupling.
         satin: paint with a sheen on some parts, or none.

@@ -35,7 +35,7 @@ class FeaturePixels:
 
     def __init__(self, part_id: NDArray[np.uint8]) -> None:
         found = cv2.findNonZero(parts_mask(part_id, _FEATURES).view(np.uint8))
-        places = np.zeros((0, 2), dtype=np.int64) if found is None else found[:, 0].astype(np.int64)
+        places = np.zeros((0, 2), dtype=np.int64) if found is None else found.reshape(-1, 2).astype(np.int64)
         parts = part_id[places[:, 1], places[:, 0]]
         order = np.argsort(parts, kind="stable")
         self._places = places[order]

@@ -93,9 +93,9 @@ def engine_notice(name: str, device: Device = "cpu") -> str | None:
     """
     _check_device(name, device)
     if name == "blender":
-        from render.blender_engine.process import bpy_version
+        from render.blender_engine.interpreter import find_blender
 
-        bpy_version()
+        find_blender()
     if name != "mitsuba":
         return None
     from render.mitsuba_engine.variant import probe_variant

@@ -149,7 +149,7 @@ def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform, nam
         right.distortion.coefficients(),
         size_px,
         right_from_left.rotation,
-        right_from_left.translation_m,
+        right_from_left.translation_m[:, None],  # OpenCV 5 takes no rows
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=-1,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.storage.layout import CARD_FILE
@@ -25,7 +26,11 @@ _LIMITS = """\
 
 def card_text(manifest: Manifest) -> str:
     """The card as Markdown with YAML front matter; depends on the manifest alone."""
-    return f"{_metadata(manifest)}\n{_body(manifest)}"
+    # The files are pairs with their truth beside them, not rows of a table.
+    values = {**card_metadata(manifest), "viewer": False}
+    # JSON's strings and lists are YAML's.
+    lines = [f"{key}: {json.dumps(value)}" for key, value in values.items()]
+    return "\n".join(["---", *lines, "---", "", card_summary(manifest), _files(manifest), card_sections(manifest)])
 
 
 def write_card(dataset: Location, manifest: Manifest) -> Location:
@@ -53,11 +58,11 @@ def citation(manifest: Manifest) -> str:
     )
 
 
-def _metadata(manifest: Manifest) -> str:
-    """Front matter; JSON's strings and lists are YAML's."""
+def card_metadata(manifest: Manifest) -> dict[str, Any]:
+    """What the Hub lists and finds a dataset by, for the card's front matter."""
     images = 2 * manifest.counts.pairs
     size = next((name for limit, name in _SIZES if images < limit), _LARGEST)
-    values = {
+    return {
         "pretty_name": manifest.name,
         "license": manifest.data_licence.lower(),
         "annotations_creators": ["machine-generated"],
@@ -65,27 +70,16 @@ def _metadata(manifest: Manifest) -> str:
         "task_categories": ["object-detection", "keypoint-detection"],
         "tags": list(_TAGS),
         "size_categories": [size],
-        # The files are pairs with their truth beside them, not rows of a table.
-        "viewer": False,
     }
-    lines = [f"{key}: {json.dumps(value)}" for key, value in values.items()]
-    return "\n".join(["---", *lines, "---", ""])
 
 
-def _body(manifest: Manifest) -> str:
+def card_summary(manifest: Manifest) -> str:
+    """The dataset's name as a title, what it shows, and the first items of its contents."""
     recipe, camera = manifest.recipe, manifest.recipe.rig.camera
     counts = manifest.counts
     splits = ", ".join(f"{name} {counts.by_split[name]}" for name in ("train", "val", "test"))
     missing = recipe.frames.count - counts.pairs
     gaps = f" {missing} of the recipe's {recipe.frames.count} pairs are not in it." if missing else ""
-    software = ", ".join(f"{name} {version}" for name, version in sorted(manifest.software.items()))
-    engines = ", ".join(f"{pairs} pairs by {engine}" for engine, pairs in sorted(manifest.engines.items()))
-    rangefinder = (
-        "\n* `frame.rangefinder_reading_m` in the records is what a laser rangefinder beside the camera reads, with "
-        "the errors that the recipe states. It is a reference with errors of its own, not the truth."
-        if recipe.rangefinder is not None
-        else ""
-    )
     return f"""# {manifest.name}
 
 {recipe.description or "Synthetic stereo images of an aerial-refuelling drogue."}
@@ -95,7 +89,17 @@ def _body(manifest: Manifest) -> str:
 {len(counts.by_scene)} scenes, {counts.empty} of them without a drogue.{gaps}
 * Pairs by split: {splits}.
 * Distance of the drogue: {_distance(recipe.distance)}.
-* Cameras: baseline {recipe.rig.baseline_m:g} m, focal length {camera.fx_px:g} px, sensor `{recipe.sensor.name}`.
+* Cameras: baseline {recipe.rig.baseline_m:g} m, focal length {camera.fx_px:g} px, sensor `{recipe.sensor.name}`."""
+
+
+def _files(manifest: Manifest) -> str:
+    rangefinder = (
+        "\n* `frame.rangefinder_reading_m` in the records is what a laser rangefinder beside the camera reads, with "
+        "the errors that the recipe states. It is a reference with errors of its own, not the truth."
+        if manifest.recipe.rangefinder is not None
+        else ""
+    )
+    return f"""\
 * For every pair the images, the part that each pixel sees, and `record.json`: pose at the middle and the ends of the
   exposure, every marker's centre and visibility in both eyes, boxes, light, exposure, and all that the frame was made
   from.{rangefinder}
@@ -103,9 +107,16 @@ def _body(manifest: Manifest) -> str:
   machine-readable form.
 
 `manifest.json` states axes, units and pixel conventions under `conventions`, and the hash of every record.
+"""
 
+
+def card_sections(manifest: Manifest) -> str:
+    """How the dataset was made, purpose, limits, licence and how to cite it: the sections after its contents."""
+    software = ", ".join(f"{name} {version}" for name, version in sorted(manifest.software.items()))
+    engines = ", ".join(f"{pairs} pairs by {engine}" for engine, pairs in sorted(manifest.engines.items()))
+    return f"""\
 ## How it was made
-By `droguekit` from `recipe.toml` with seed {recipe.seed}: {engines or "no pair yet"}.
+By `droguekit` from `recipe.toml` with seed {manifest.recipe.seed}: {engines or "no pair yet"}.
 Software: {software}. Dataset sha256: `{manifest.dataset_sha256}`.
 
 `droguekit render recipe.toml --out DIR` makes it again, `droguekit validate DIR` checks every file and label, and

@@ -105,6 +105,8 @@ class PoseEstimate(FrozenModel):
     """A pose of the drogue.
 
     Attributes:
+        frame_index: of the pair.
+        method: name of the method.
         left_from_drogue: modulo the markers' symmetry.
         covariance: (6, 6) in the tangent space that `tangent` names; None where the method gives none.
         modes: every pose that explains the images, the best first; weights sum to 1.
@@ -134,7 +136,18 @@ class PoseEstimate(FrozenModel):
 
 
 class NoFix(FrozenModel):
-    """No pose, with the reason; other attributes as those of a pose."""
+    """No pose, with the reason.
+
+    Attributes:
+        frame_index: of the pair.
+        method: name of the method.
+        reason: why there is none.
+        features: the measured image points.
+        stage_s: computing time by stage. [s]
+        regions: search regions, at most one an eye.
+        latency_s: from the arrival of the images to this result, in real time. [s]
+        time_s: of the images, in real time. [s]
+    """
 
     status: Literal["no_fix"] = "no_fix"
     frame_index: int = Field(ge=0)

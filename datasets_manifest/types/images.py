@@ -16,8 +16,10 @@ class StereoImages:
     """One stereo pair of images.
 
     Attributes:
-        left, right: (H, W, 3) in the order red, green, blue, or (H, W) for a mono sensor.
-        left_mosaic, right_mosaic: (H, W) raw RGGB mosaic of a Bayer sensor, else None.
+        left: (H, W, 3) in the order red, green, blue, or (H, W) for a mono sensor.
+        right: as `left`.
+        left_mosaic: (H, W) raw RGGB mosaic of a Bayer sensor, else None.
+        right_mosaic: as `left_mosaic`.
         bits: significant bits: 8 in uint8, 12 in uint16.
         encoding: `linear`, or `gamma` (the sRGB curve); a mosaic is always linear.
         black_level_dn: pixel value without light. [DN]

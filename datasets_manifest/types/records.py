@@ -105,12 +105,22 @@ class PairRecord(FrozenModel):
     """All labels of one stereo pair.
 
     Attributes:
+        frame_index: in the dataset.
+        scene_id: of the drawn environment.
+        sequence_id: None for a single pair.
+        time_s: mid-exposure. [s]
         left_from_drogue: at mid-exposure; None in an empty frame.
-        left_from_drogue_open, left_from_drogue_close: when the shutter opens and closes.
-        pitch_deg, yaw_deg, roll_deg: of `left_from_drogue`.
+        left_from_drogue_open: when the shutter opens.
+        left_from_drogue_close: when the shutter closes.
+        pitch_deg: of `left_from_drogue`.
+        yaw_deg: of `left_from_drogue`.
+        roll_deg: of `left_from_drogue`.
         roll_modulo_deg: roll modulo the markers' symmetry, in [0, 360/order).
+        views: labels of both images.
+        conditions: by which reports group pairs.
         file_sha256: of every other file of the frame, by name.
-        engine, engine_version: renderer of the radiance.
+        engine: renderer of the radiance.
+        engine_version: of the renderer.
         image_black_level_dn: pixel value of the stored images without light. [DN]
         frame: the specification that it was made from.
     """

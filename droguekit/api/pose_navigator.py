@@ -22,7 +22,7 @@ class Navigator:
 
     Without a tracker and a filter each pair is estimated by itself; with either, pairs must come in the order of time.
 
-    Example:
+    Examples:
         >>> navigator = droguekit.Navigator(dataset.rig, dataset.drogue)
         >>> estimate = navigator(pair.left, pair.right)
     """

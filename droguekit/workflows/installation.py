@@ -133,23 +133,23 @@ def engine_lines() -> Generator[str, None, bool]:
 
 def _blender_lines() -> Iterator[str]:
     """Start Blender, which only its own engine needs."""
-    from render.blender_engine.process import BlenderProcess, bpy_version
+    from render.blender_engine.interpreter import find_blender
+    from render.blender_engine.process import BlenderProcess
 
     try:
-        found = bpy_version()
+        chosen = find_blender()
     except ValueError as error:
         yield f"engine     blender is optional: {error}"
         return
-    missing = [package for library, package in _BLENDER_LIBRARIES.items() if not _loads(library)]
-    if missing:
-        yield f"engine     blender does not work: apt-get install {' '.join(missing)}"
-        return
     try:
-        BlenderProcess().close()
+        process = BlenderProcess(chosen)
     except ValueError as error:
-        yield f"engine     blender does not work: {error}"
+        missing = [package for library, package in _BLENDER_LIBRARIES.items() if not _loads(library)]
+        reason = f"apt-get install {' '.join(missing)}" if missing else str(error)
+        yield f"engine     blender does not work: {reason}"
         return
-    yield f"engine     blender works: bpy {found}, Cycles on the CPU, in a process of its own"
+    process.close()
+    yield f"engine     blender works: {process.version}, Cycles on the CPU, by {chosen.path} ({chosen.origin})"
 
 
 def _loads(library: str) -> bool:
@@ -162,11 +162,11 @@ def _loads(library: str) -> bool:
 
 def _missing_libraries() -> list[tuple[str, str]]:
     """System libraries that Mitsuba asks for and that are not here, each with what to do."""
-    from render.mitsuba_engine.variant import llvm_libraries
+    from render.mitsuba_engine.variant import LLVM_REMEDY, llvm_libraries
 
     missing = []
     if not _loads(_LIBATOMIC[0]):
         missing.append(_LIBATOMIC)
     if not any(library.exists() for library in llvm_libraries()):
-        missing.append(("LLVM >= 15", "apt-get install libllvm15 (or newer), or name one in DRJIT_LIBLLVM_PATH"))
+        missing.append(("LLVM >= 15", f"{LLVM_REMEDY}, or name one in DRJIT_LIBLLVM_PATH"))
     return missing

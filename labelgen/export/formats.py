@@ -74,6 +74,11 @@ FORMATS: dict[str, ExportFormat] = {
     "webdataset": ExportFormat(
         "tar shards of images, part ids and records", "labelgen.export.packages.tar_shards:write_webdataset"
     ),
+    "huggingface": ExportFormat(
+        "Parquet with images, for load_dataset and the Hub, and its card",
+        "labelgen.export.packages.huggingface:write_huggingface",
+        "exports",
+    ),
     "parquet": ExportFormat("one table, a row a view", "labelgen.export.packages.parquet:write_parquet", "exports"),
     "rosbag": ExportFormat(
         "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.poses.rosbag:write_rosbag", "exports"

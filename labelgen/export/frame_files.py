@@ -77,18 +77,34 @@ def export_image(
     if stored_bits == 8:
         export_file(source, frame_index, name, target)
         return
-    where = source.frames.where(frame_index, name)
-    pixels = decode_png(source.frames.read(frame_index, name), where, source.manifest.recipe.rig.camera)
     if bits == 8:
+        where = source.frames.where(frame_index, name)
+        pixels = decode_png(source.frames.read(frame_index, name), where, source.manifest.recipe.rig.camera)
         data = encode_png((pixels >> (stored_bits - 8)).astype(np.uint8))
         log.lost(f"images of {stored_bits} bits: written with their upper 8")
     else:
-        # The upper bits again below, so that the largest number stays the largest.
-        low = 16 - stored_bits
-        whole = (pixels << low | pixels >> (stored_bits - low)).astype(np.uint16)
-        data = with_significant_bits(encode_png(whole), stored_bits, channels=1 if pixels.ndim == 2 else 3)
+        data = full_range_png(source, frame_index, name)
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
+
+
+def full_range_png(source: Dataset, frame_index: int, name: str) -> bytes:
+    """A frame's image or mosaic with all of its bits, as a PNG whose values use the whole range of its samples.
+
+    Of 8 bits it is the file itself. Of 12, values are moved to the top of 16, with an sBIT chunk that says how many
+    bits are significant.
+
+    Raises:
+        ValueError: the file is missing or damaged; names it.
+    """
+    data, bits = source.frames.read(frame_index, name), source.manifest.recipe.sensor.output_bits
+    if bits == 8:
+        return data
+    pixels = decode_png(data, source.frames.where(frame_index, name), source.manifest.recipe.rig.camera)
+    # The upper bits again below, so that the largest number stays the largest.
+    low = 16 - bits
+    whole = (pixels << low | pixels >> (bits - low)).astype(np.uint16)
+    return with_significant_bits(encode_png(whole), bits, channels=1 if pixels.ndim == 2 else 3)
 
 
 def with_significant_bits(png: bytes, bits: int, channels: int) -> bytes:

@@ -293,7 +293,7 @@ def _point_faults(
         turn, _ = cv2.Rodrigues(real_from_ideal @ pose.rotation)
         offset = real_from_ideal @ (pose.translation_m - rig.eye_offset_m(eye))
         want, _ = cv2.projectPoints(points_m, turn, offset, lens.camera.matrix(), lens.distortion.coefficients())
-        error = np.abs(labelled[eye] - want[:, 0]).max(axis=1)
+        error = np.abs(labelled[eye] - want.reshape(-1, 2)).max(axis=1)
         for index in np.flatnonzero(~(error <= _PROJECTION_TOLERANCE_PX)):
             faults.append(f"{eye}: {names[index]}: is {error[index]:.3g} px off the pose's image")
         try:

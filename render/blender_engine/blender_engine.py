@@ -28,7 +28,6 @@ from render.blender_engine.process import (
     BlenderEndedError,
     BlenderProcess,
     CenterPixels,
-    bpy_version,
     paste,
     read_light,
     read_passes,
@@ -86,9 +85,9 @@ class BlenderEngine:
     name = "blender"
 
     def __init__(self) -> None:
-        self.version = f"blender {bpy_version()} cycles cpu, render version {RENDER_VERSION}"
         self._stage = Stage()
         self._process = BlenderProcess()
+        self.version = f"blender {self._process.version} cycles cpu, render version {RENDER_VERSION}"
         self._stage_s: dict[str, float] = {}
 
     def close(self) -> None:

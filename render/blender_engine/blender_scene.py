@@ -1,7 +1,7 @@
 """The three Blender scenes of a stage, and pictures of them: everything lit, everything for the passes, features alone.
 
 The stage stands still; camera, sun and sky move around it. A camera is a pinhole or has a lens with distortion. Only
-Blender's own process imports this module.
+Blender's own process imports this module, which needs `bpy`, numpy and the standard library alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 import bpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from render.blender_engine.messages import (
     FEATURES,
@@ -182,8 +181,7 @@ class BlenderScene:
     def _set_light(self, light: StageLight) -> None:
         self._sky.set(light)
         # A sun lamp shines along its own -z.
-        towards, _ = Rotation.align_vectors([light.to_sun], [[0.0, 0.0, 1.0]])
-        self._sun.rotation_quaternion = towards.as_quat(scalar_first=True)
+        self._sun.rotation_quaternion = light.stage_from_sun
         strength = float(light.sun.max())
         self._sun.data.energy = strength
         self._sun.data.color = (light.sun / strength).tolist() if strength > 0 else (0.0, 0.0, 0.0)
@@ -221,8 +219,7 @@ class _Sky:
         # Blender's map runs from the nadir up; its middle column looks along +x, and the next ones turn to -y.
         turned = np.roll(light.sky[::-1, ::-1], -light.sky.shape[1] // 2, axis=1)
         replace_image(self._texture, turned)
-        angles = Rotation.from_matrix(light.world_from_stage).as_euler("xyz")
-        self._turn.inputs["Rotation"].default_value = angles.tolist()
+        self._turn.inputs["Rotation"].default_value = light.world_from_stage_rad.tolist()
 
 
 def _set_vertices(mesh: Any, placed: MovedMesh) -> None:

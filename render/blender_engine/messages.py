@@ -1,7 +1,12 @@
-"""Messages from the engine to Blender's process: plain arrays, made by the engine, rendered by the process."""
+"""Messages from the engine to Blender's process: plain arrays, made by the engine, rendered by the process.
+
+The process may run on another Python with another numpy: this module needs numpy and the standard library alone.
+"""
 
 from __future__ import annotations
 
+import io
+import pickle
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,15 +88,15 @@ class StageLight:
 
     Attributes:
         sky: (H, 2H, 3) map: row 0 is the zenith, column 0 looks along +x, the next ones turn towards +y. [unit]
-        world_from_stage: (3, 3) rotation.
-        to_sun: (3,) direction in the stage's axes.
+        world_from_stage_rad: (3,) rotation as angles about the fixed axes x, y and z, in this order. [rad]
+        stage_from_sun: (4,) quaternion, scalar first, that turns +z to the sun.
         sun: (3,) illuminance of a plane that faces it. [unit times sr]
         unit_cd_m2: the radiance that Blender's numbers count in, so that they stay near 1 by day and night. [cd/m2]
     """
 
     sky: NDArray[np.float32]
-    world_from_stage: NDArray[np.float64]
-    to_sun: NDArray[np.float64]
+    world_from_stage_rad: NDArray[np.float64]
+    stage_from_sun: NDArray[np.float64]
     sun: NDArray[np.float64]
     unit_cd_m2: float
 
@@ -182,3 +187,24 @@ class PictureRequest:
     bounces: int
     seed: int
     file: str
+
+
+class _PlainPickler(pickle.Pickler):
+    """Writes numbers as their bytes: the names that numpy's own pickles hold differ between numpy 1 and 2."""
+
+    def reducer_override(self, item: Any) -> Any:
+        """How an array or one of its numbers is written; all else as usual."""
+        if isinstance(item, np.ndarray | np.generic):
+            return _numbers, (item.dtype.str, item.shape, item.tobytes())
+        return NotImplemented
+
+
+def _numbers(dtype: str, shape: tuple[int, ...], data: bytes) -> Any:
+    return np.frombuffer(data, dtype=dtype).reshape(shape).copy()[()]
+
+
+def pickled(request: FrameSetup | PictureRequest) -> bytes:
+    """A request as a pickle that any numpy from 1.26 on reads."""
+    file = io.BytesIO()
+    _PlainPickler(file).dump(request)
+    return file.getvalue()

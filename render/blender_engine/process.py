@@ -6,19 +6,18 @@ import os
 import pickle
 import shutil
 import subprocess
-import sys
 import tempfile
 import weakref
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow, PictureRequest
+from render.blender_engine.interpreter import OLDEST_BLENDER, BlenderInterpreter, find_blender
+from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow, PictureRequest, pickled
 
 _MEMORY_FOLDER = Path("/dev/shm")
 _GRACE_S = 5.0
@@ -30,52 +29,42 @@ class BlenderEndedError(RuntimeError):
     """Blender's process ended by itself."""
 
 
-def bpy_version() -> str:
-    """The installed version of Blender's Python package, which is not imported for this.
-
-    Raises:
-        ValueError: it is not installed.
-    """
-    try:
-        return version("bpy")
-    except PackageNotFoundError as error:
-        raise ValueError("engine blender: not installed; install it with: pip install 'droguekit[blender]'") from error
-
-
 class BlenderProcess:
     """A running Blender process.
 
+    Args:
+        interpreter: that runs it; by default the one that `find_blender` finds.
+
     Attributes:
         folder: for pictures; in memory where the system allows it.
+        version: Blender's, such as 5.0.1.
         start_cpu_s: CPU time of its start. [s]
 
     Raises:
         ValueError: Blender cannot be loaded; the message says what is missing.
     """
 
-    def __init__(self) -> None:
-        bpy_version()
+    def __init__(self, interpreter: BlenderInterpreter | None = None) -> None:
+        chosen = find_blender() if interpreter is None else interpreter
         in_memory = _MEMORY_FOLDER.is_dir() and os.access(_MEMORY_FOLDER, os.W_OK)
         self.folder = Path(tempfile.mkdtemp(prefix="droguekit-blender-", dir=_MEMORY_FOLDER if in_memory else None))
         self._log = self.folder / "log.txt"
-        with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                # -P: a file in the working folder must not replace one of Blender's modules.
-                [sys.executable, "-P", "-m", "render.blender_engine.worker", str(self.folder)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                # A signal to the engine's process group must not kill it before it cleans up; it ends with its input.
-                start_new_session=True,
-                # The user's start-up file and add-ons must not change pictures.
-                env={**os.environ, "BLENDER_USER_RESOURCES": str(self.folder)},
-            )
-        self._end = weakref.finalize(self, _end, self._process, self.folder)
         try:
-            self.start_cpu_s = self._read_answer()
+            self._process, self._answers = _start(chosen, self.folder, self._log)
+        except (OSError, ValueError) as error:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise ValueError(f"engine blender: {error}") from error
+        self._end = weakref.finalize(self, _end, self._process, self._answers, self.folder)
+        try:
+            hello = self._read_answer()
         except (BlenderEndedError, ValueError) as error:
             self.close()
-            raise ValueError(f"engine blender: cannot be loaded: {error}; droguekit doctor says more") from error
+            raise ValueError(
+                f"engine blender: cannot be loaded by {chosen.path} ({chosen.origin}): {error}; "
+                "droguekit doctor says more"
+            ) from error
+        self.version = str(hello["blender"])
+        self.start_cpu_s = float(hello["cpu_s"])
 
     def ask(self, request: FrameSetup | PictureRequest) -> float:
         """Send a request and wait until it is done.
@@ -89,25 +78,24 @@ class BlenderProcess:
         """
         assert self._process.stdin is not None
         try:
-            pickle.dump(request, self._process.stdin)
+            self._process.stdin.write(pickled(request))
             self._process.stdin.flush()
         except OSError as error:
             raise BlenderEndedError(self._exit_reason()) from error
-        return self._read_answer()
+        return float(self._read_answer()["cpu_s"])
 
     def close(self) -> None:
         """End the process, even in the middle of a picture, and remove its folder."""
         self._end()
 
-    def _read_answer(self) -> float:
-        assert self._process.stdout is not None
+    def _read_answer(self) -> dict[str, Any]:
         try:
-            answer = pickle.load(self._process.stdout)
+            answer: dict[str, Any] = pickle.load(self._answers)
         except (EOFError, pickle.UnpicklingError) as error:
             raise BlenderEndedError(self._exit_reason()) from error
         if "error" in answer:
             raise ValueError(str(answer["error"]))
-        return float(answer["cpu_s"])
+        return answer
 
     def _exit_reason(self) -> str:
         try:
@@ -118,9 +106,41 @@ class BlenderProcess:
         return f"the process ended with status {status}" + (f": {lines[-1].strip()}" if lines else "")
 
 
-def _end(process: subprocess.Popen[bytes], folder: Path) -> None:
+def _start(interpreter: BlenderInterpreter, folder: Path, log: Path) -> tuple[subprocess.Popen[bytes], BinaryIO]:
+    """The process and its answers, which have a pipe of their own: Blender prints on its standard output."""
+    # The other interpreter must find our modules, and none of the packages that are installed beside them.
+    sources = folder / "sources"
+    sources.mkdir()
+    (sources / "render").symlink_to(Path(__file__).resolve().parents[1])
+    answers, write_end = os.pipe()
+    code = (
+        f"import sys; sys.path.insert(0, {str(sources)!r}); sys.dont_write_bytecode = True; "
+        f"from render.blender_engine.worker import main; main({str(folder)!r}, {write_end}, {OLDEST_BLENDER!r})"
+    )
+    try:
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                interpreter.command(code),
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                pass_fds=(write_end,),
+                # A signal to the engine's process group must not kill it before it cleans up; it ends with its input.
+                start_new_session=True,
+                # The user's start-up file and add-ons must not change pictures.
+                env={**os.environ, "BLENDER_USER_RESOURCES": str(folder)},
+            )
+    except (OSError, ValueError):
+        os.close(answers)
+        raise
+    finally:
+        os.close(write_end)
+    return process, os.fdopen(answers, "rb")
+
+
+def _end(process: subprocess.Popen[bytes], answers: BinaryIO, folder: Path) -> None:
     """Close the process's input, on which it ends at once, and remove its folder."""
-    for pipe in (process.stdin, process.stdout):
+    for pipe in (process.stdin, answers):
         if pipe is not None:
             try:
                 pipe.close()

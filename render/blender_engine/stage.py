@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import PaintedMesh
@@ -130,10 +131,11 @@ def _light(frame: FrameSpec, ambient: EnvironmentRadiance) -> StageLight:
     world_from_stage = (frame.world_from_left @ frame.left_from_stage_at(0.0)).rotation
     light_map = ambient.light_map
     unit_cd_m2 = max(float(light_map.mean()), 1e-12)
+    stage_from_sun, _ = Rotation.align_vectors([world_from_stage.T @ ambient.beam_direction], [[0.0, 0.0, 1.0]])
     return StageLight(
         sky=(light_map / np.float32(unit_cd_m2)).astype(np.float32),
-        world_from_stage=world_from_stage,
-        to_sun=world_from_stage.T @ ambient.beam_direction,
+        world_from_stage_rad=Rotation.from_matrix(world_from_stage).as_euler("xyz"),
+        stage_from_sun=stage_from_sun.as_quat(scalar_first=True),
         sun=ambient.beam_illuminance_lux / unit_cd_m2,
         unit_cd_m2=unit_cd_m2,
     )

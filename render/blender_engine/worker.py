@@ -1,6 +1,7 @@
 """Blender's own process: reads requests from its standard input until that closes.
 
-Importing `bpy` changes `sys.path` and puts the process under Blender's licence; so it runs nothing else.
+Importing `bpy` changes `sys.path` and puts the process under Blender's licence; so it runs nothing else. It may run on
+another Python than the engine: this module and what it imports need `bpy`, numpy and the standard library alone.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import pickle
 import queue
 import shutil
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -29,24 +29,29 @@ def _read_requests(requests: BinaryIO, inbox: queue.SimpleQueue[FrameSetup | Pic
         os._exit(0)
 
 
-def main() -> None:
-    """Serve one engine. Its argument is the folder that is removed at the end."""
-    folder = Path(sys.argv[1])
+def main(folder_name: str, answers_fd: int, oldest_blender: str) -> None:
+    """Serve one engine.
+
+    Args:
+        folder_name: of the folder that is removed at the end.
+        answers_fd: file descriptor to answer on.
+        oldest_blender: version that has all that the pictures need.
+    """
+    folder = Path(folder_name)
     requests = os.fdopen(os.dup(0), "rb")
-    answers = os.fdopen(os.dup(1), "wb")
-    # Blender prints on standard output, which is redirected to standard error.
-    os.dup2(2, 1)
+    answers = os.fdopen(answers_fd, "wb")
     _ignore_signals()
     inbox: queue.SimpleQueue[FrameSetup | PictureRequest] = queue.SimpleQueue()
     threading.Thread(target=_read_requests, args=(requests, inbox, folder), daemon=True).start()
     try:
+        found = _blender_version(oldest_blender)
         from render.blender_engine.blender_scene import BlenderScene, render_picture
     except ImportError as error:
         _answer(answers, {"error": str(error)})
         return
     _ignore_signals()
     scene = BlenderScene()
-    _answer(answers, {"cpu_s": time.process_time()})
+    _answer(answers, {"cpu_s": time.process_time(), "blender": found})
     while True:
         request, started = inbox.get(), time.process_time()
         try:
@@ -58,6 +63,21 @@ def main() -> None:
             _answer(answers, {"error": f"{type(error).__name__}: {error}"})
             continue
         _answer(answers, {"cpu_s": time.process_time() - started})
+
+
+def _blender_version(oldest: str) -> str:
+    """This Blender's version.
+
+    Raises:
+        ImportError: there is no Blender, or one that is too old.
+    """
+    import bpy
+
+    version: tuple[int, ...] = bpy.app.version
+    found = ".".join(map(str, version))
+    if version < tuple(map(int, oldest.split("."))):
+        raise ImportError(f"this is Blender {found}, and {oldest} or newer is needed")
+    return found
 
 
 def _ignore_signals() -> None:
@@ -73,7 +93,3 @@ def _ignore_signals() -> None:
 def _answer(answers: BinaryIO, content: dict[str, Any]) -> None:
     pickle.dump(content, answers)
     answers.flush()
-
-
-if __name__ == "__main__":
-    main()

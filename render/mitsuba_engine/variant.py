@@ -21,6 +21,8 @@ from render.device import Device
 from render.engine import EngineUnavailableError
 from render.mitsuba_engine.gpu_trial import kernel_module
 
+LLVM_REMEDY = "apt-get install libllvm19 (or another one from 17 on)"
+"""Debian 12 has 19. Mitsuba 3.9.0 works with 15 too; 3.9.1 aborts the process with 15 and 16."""
 _OLDEST_LLVM = 15
 _PROBE_TIMEOUT_S = 120
 # By these a user chooses a GPU, or the driver's libraries.
@@ -71,7 +73,12 @@ def llvm_libraries() -> list[Path]:
 
 
 def _cache_file() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "droguekit" / "variant-verdicts.json"
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        # A user without a home, as containers have: a file that can neither be read nor written.
+        cache = Path(os.devnull)
+    return cache / "droguekit" / "variant-verdicts.json"
 
 
 def _works(library: Path) -> bool:
@@ -193,4 +200,4 @@ def probe_variant(device: Device = "cpu") -> Variant:
             return Variant("llvm_ad_rgb", f"LLVM works: {library}", library)
     tried = ", ".join(str(library) for library in libraries)
     reason = f"no LLVM library works (tried {tried})" if libraries else f"no LLVM library >= {_OLDEST_LLVM} found"
-    return Variant("scalar_rgb", f"{reason}; about 3 times slower")
+    return Variant("scalar_rgb", f"{reason}; about 3 times slower; {LLVM_REMEDY}")

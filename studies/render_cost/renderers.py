@@ -24,8 +24,9 @@ from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import exp_twist
 from geometry.stereo import EYES, Eye
 from render.blender_engine.camera_path import EyePath
+from render.blender_engine.interpreter import find_blender
 from render.blender_engine.messages import FrameSetup, ImageWindow
-from render.blender_engine.process import bpy_version, read_light
+from render.blender_engine.process import read_light
 from render.blender_engine.stage import Stage
 from render.camera.sensor import expose
 from render.compositing import inside_one_part
@@ -189,10 +190,11 @@ def measure_plain_cycles(
         full_samples: most samples over every pixel; with fewer than needed the cost is a lower bound.
 
     Raises:
-        ValueError: Blender is not installed.
+        ValueError: this Python has no Blender; a script of the study runs on it.
         OSError: its process failed; the message has its last line.
     """
-    bpy_version()
+    if not find_blender().is_this_python:
+        raise ValueError("this study needs Blender's package in this Python: pip install 'droguekit[blender]'")
     setup = Stage().set_frame(view.frame, environment_radiance(view.frame.environment))
     around = view.crop
 

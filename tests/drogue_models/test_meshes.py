@@ -30,8 +30,13 @@ def front_triangles(mesh: trimesh.Trimesh, z_m: float = 0.0) -> np.ndarray:
     return triangles[(triangles[:, :, 2] == z_m).all(axis=1)][:, :, :2]
 
 
+def areas_m2(triangles: np.ndarray) -> np.ndarray:
+    """(T,) areas of (T, 3, 2) triangles."""
+    return np.abs(np.linalg.det(triangles[:, 1:] - triangles[:, :1])) / 2
+
+
 def area_m2(triangles: np.ndarray) -> float:
-    return float(np.abs(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])).sum() / 2)
+    return float(areas_m2(triangles).sum())
 
 
 def first_hit_share(origin: np.ndarray, target: np.ndarray, triangles: np.ndarray) -> float:
@@ -84,7 +89,7 @@ def test_markers_have_the_area_and_centre_of_their_discs(drogue: DrogueParameter
     meshes = drogue_meshes(drogue)
     for index, center in enumerate(drogue.marker_positions_m):
         front = front_triangles(meshes[marker_id(index)])
-        areas = np.abs(np.cross(front[:, 1] - front[:, 0], front[:, 2] - front[:, 0])) / 2
+        areas = areas_m2(front)
         # The polygon's radius is chosen for the disc's area: rounding of about 126 triangles is left.
         assert areas.sum() == pytest.approx(np.pi * drogue.marker_radius_m**2, rel=1e-12)
         centroid = (front.mean(axis=1) * areas[:, None]).sum(axis=0) / areas.sum()

@@ -28,7 +28,7 @@ def test_rig_is_opencv_s_rectified_rig() -> None:
     camera = RIG.camera
     size = (camera.width_px, camera.height_px)
     # OpenCV's T takes left coordinates to right ones.
-    T = np.array([-RIG.baseline_m, 0.0, 0.0])
+    T = np.array([[-RIG.baseline_m], [0.0], [0.0]])
     K, undistorted = camera.matrix(), np.zeros(5)
     R1, R2, P1, P2, Q, _, _ = cv2.stereoRectify(
         K, undistorted, K, undistorted, size, np.eye(3), T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=-1, newImageSize=size

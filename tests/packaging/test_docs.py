@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import droguekit
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
@@ -196,3 +197,10 @@ def test_the_pages_build_without_a_warning_and_fetch_nothing(tmp_path: Path) -> 
         r"""<(?:script|img|iframe)[^>]*\ssrc="?https?:|<link[^>]*rel="?stylesheet[^>]*href="?https?:"""
     )
     assert [page.name for page in pages if fetched.search(page.read_text(encoding="utf-8"))] == []
+    interface = (tmp_path / "reference" / "python-api.html").read_text(encoding="utf-8")
+    public = [*droguekit.__all__, *(f"torch.{name}" for name in ("PairDataset", "RenderStream", "sample_of_pair"))]
+    assert [name for name in public if f'id="droguekit.{name}"' not in interface] == []
+    # Names that share a line of a docstring would be taken for a name and its type.
+    assert re.findall(r"<b>\w+,</b>", interface) == []
+    examples = sorted(path.name for path in (REPOSITORY / "docs" / "examples").iterdir() if path.is_file())
+    assert examples == sorted(path.stem for path in (tmp_path / "examples").glob("*.html"))

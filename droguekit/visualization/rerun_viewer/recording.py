@@ -122,12 +122,12 @@ class PairRecorder:
             self._log(f"rig/{eye}", *_eye(rig, eye), static=True)
         for curve in CURVES:
             for name, color in self._methods.items():
-                self._log(_path("errors", curve, name), rr.SeriesLine(color=color, name=name), static=True)
+                self._log(_path("errors", curve, name), rr.SeriesLines(colors=[color], names=[name]), static=True)
 
     def add(self, pair: ShownPair, estimates: Mapping[str, Estimate]) -> None:
         """Log a pair and the methods' estimates of it."""
-        rr.set_time_sequence(FRAMES, pair.frame_index, recording=self._to)
-        rr.set_time_seconds(SECONDS, pair.images.time_s, recording=self._to)
+        rr.set_time(FRAMES, sequence=pair.frame_index, recording=self._to)
+        rr.set_time(SECONDS, duration=pair.images.time_s, recording=self._to)
         self._add_images(pair)
         if pair.record is not None:
             self._add_truth(pair)
@@ -174,7 +174,7 @@ class PairRecorder:
         if record.conditions.distance_m is None:
             self._clear("distance_m")
         else:
-            self._log("distance_m", rr.Scalar(record.conditions.distance_m))
+            self._log("distance_m", rr.Scalars(record.conditions.distance_m))
         for eye, view in (("left", record.views.left), ("right", record.views.right)):
             self._add_view(f"rig/{eye}", view)
 
@@ -206,7 +206,7 @@ class PairRecorder:
         error = pose_error(pose, truth)
         values = (1e3 * error.position_m, float(error.components[3]), float(error.components[4]))
         for curve, value in zip(CURVES, values, strict=True):
-            self._log(_path("errors", curve, method), rr.Scalar(value))
+            self._log(_path("errors", curve, method), rr.Scalars(value))
 
 
 def blueprint() -> rrb.Blueprint:
@@ -304,4 +304,5 @@ def _box(box: PixelBox) -> rr.Boxes2D:
 
 def _path(*parts: str) -> str:
     """An entity's path, escaped, since methods may have any name."""
-    return rr.new_entity_path(list(parts))
+    path: str = rr.new_entity_path(list(parts))
+    return path

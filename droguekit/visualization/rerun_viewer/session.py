@@ -18,7 +18,7 @@ import rerun as rr
 from datasets_manifest.atomic import part_path
 from datasets_manifest.types.estimates import Estimate
 from droguekit.batch.progress import ProgressReport
-from droguekit.visualization.rerun_viewer.recording import APPLICATION, PairRecorder, ShownPairs, blueprint
+from droguekit.visualization.rerun_viewer.recording import APPLICATION, FRAMES, PairRecorder, ShownPairs, blueprint
 
 # Only this machine can connect to the viewer.
 _HOST = "127.0.0.1"
@@ -54,7 +54,7 @@ def view_pairs(
         OSError: the file cannot be written, or no viewer can be opened.
     """
     # A new id for each: the viewer would join recordings of the same id.
-    recording = rr.new_recording(APPLICATION)
+    recording = rr.RecordingStream(APPLICATION)
     if save is None:
         _open_viewer(recording)
         return _log_pairs(recording, source, frames, estimates, report)
@@ -96,9 +96,7 @@ def _open_viewer(recording: rr.RecordingStream) -> None:
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGKILL)
         raise OSError(None, "the viewer does not open; write a recording with --save FILE.rrd")
-    rr.connect_tcp(
-        f"{_HOST}:{port}", flush_timeout_sec=_OPEN_TIMEOUT_S, default_blueprint=blueprint(), recording=recording
-    )
+    rr.connect_grpc(f"rerun+http://{_HOST}:{port}/proxy", default_blueprint=blueprint(), recording=recording)
 
 
 def _free_port() -> int:
@@ -138,7 +136,7 @@ def _log_pairs(
             report.advance()
     finally:
         report.end()
-    recording.flush(blocking=True)
+    recording.flush()
     return ViewSummary(tuple(shown), tuple(faults))
 
 
@@ -149,9 +147,22 @@ def _check_recording(path: Path, pairs: int) -> None:
         OSError: it does not hold all pairs.
     """
     try:
-        view = rr.dataframe.load_recording(path).view(index="frame", contents="rig/left/image")
-        found = view.select(columns=["frame"]).read_all().num_rows if pairs else 0
+        found = _count_images(path) if pairs else 0
     except (ValueError, RuntimeError) as error:
         raise OSError(None, "what was written cannot be read again; is the disk full?") from error
     if found != pairs:
         raise OSError(None, f"only {found} of {pairs} pairs are in it; is the disk full?")
+
+
+def _count_images(path: Path) -> int:
+    """Left images in a file, by the reader that this version of rerun has.
+
+    Raises:
+        ValueError, RuntimeError: the file cannot be read.
+    """
+    if hasattr(rr, "dataframe"):  # up to rerun 0.23, the last for numpy 1
+        view = rr.dataframe.load_recording(path).view(index=FRAMES, contents="rig/left/image")
+        return int(view.select(columns=[FRAMES]).read_all().num_rows)
+    from rerun.chunk import RrdReader
+
+    return sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/rig/left/image")

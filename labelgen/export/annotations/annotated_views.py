@@ -98,6 +98,15 @@ def annotated_views(source: Dataset, images: Path, log: ExportLog) -> Iterator[A
             yield AnnotatedView(record, eye, split, file_name, size_px, tuple(objects), tuple(points))
 
 
+def annotated_objects(source: Dataset, record: PairRecord, eye: Eye, log: ExportLog) -> list[AnnotatedObject]:
+    """What is seen on a view: the drogue first, then hub and markers; the log counts what is not.
+
+    Raises:
+        ValueError: part ids that cannot be read; names the file.
+    """
+    return _objects(record, eye, read_part_ids(source, record, eye), log)
+
+
 def _other_drogues(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None) -> list[AnnotatedObject]:
     objects = []
     for index, seen in enumerate(view_of(record, eye).neighbours):

@@ -213,6 +213,11 @@ def coco_image_id(frame_index: int, eye: Eye) -> int:
     return 2 * frame_index + EYES.index(eye) + 1
 
 
+def coco_feature_id(image_id: int, marker_index: int | None) -> int:
+    """Id of the annotation of a marker, or of the hub where the index is None, on an image."""
+    return (1 if marker_index is None else 2 + marker_index) * _FEATURE_ID_STEP + image_id
+
+
 def coco_header(manifest: Manifest, with_features: bool) -> dict[str, Any]:
     """The file's `info`, `licenses` and `categories`.
 
@@ -405,7 +410,7 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
         feature, index = seen.feature, seen.marker_index
         entries.append(
             {
-                "id": (1 if index is None else 2 + index) * _FEATURE_ID_STEP + image_id,
+                "id": coco_feature_id(image_id, index),
                 "image_id": image_id,
                 "category_id": HUB if index is None else MARKER,
                 "iscrowd": 0,

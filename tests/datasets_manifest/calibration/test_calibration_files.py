@@ -21,6 +21,7 @@ from datasets_manifest.calibration.calibration_files import (
 from datasets_manifest.recipe.rigs import resolve_rig
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, StereoRig, paper_rig
+from tests.support.stereo_calibrations import opencv_ideal_px
 
 RIGS = [paper_rig(), resolve_rig("paper-real", 6)[0]]
 POINTS_M = np.random.default_rng(4).uniform([-0.2, -0.15, 1], [0.2, 0.15, 1], (30, 3)) * 7.0
@@ -64,17 +65,16 @@ def test_camera_info_rectifies_what_is_seen(rig: StereoRig) -> None:
         projection = data_of(table, "projection_matrix")
         # ROS's definition of the baseline: P[0, 3] = -fx B.
         assert projection[0, 3] == (0.0 if eye == "left" else -256.0)
-        found = cv2.undistortPointsIter(
-            rig.image(POINTS_M, eye)[:, None],
+        found = opencv_ideal_px(
+            rig.image(POINTS_M, eye),
             data_of(table, "camera_matrix"),
             data_of(table, "distortion_coefficients"),
             data_of(table, "rectification_matrix"),
             projection[:, :3],
-            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14),
         )
         # The right eye's point in the left frame, by the whole projection matrix.
         homogeneous = np.column_stack([POINTS_M, np.ones(len(POINTS_M))]) @ projection.T
-        np.testing.assert_allclose(found[:, 0], homogeneous[:, :2] / homogeneous[:, 2:], atol=1e-8)
+        np.testing.assert_allclose(found, homogeneous[:, :2] / homogeneous[:, 2:], atol=1e-8)
 
 
 def test_a_third_radial_coefficient_has_no_place_in_kalibr(tmp_path: Path) -> None:

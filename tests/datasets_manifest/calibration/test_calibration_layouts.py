@@ -159,7 +159,7 @@ CHAIN: dict[str, Any] = {
         "rostopic": "/cam1/image_raw",
     },
 }
-CHAIN_R1 = cv2.stereoRectify(M1, D2, M2, D2, SIZE_PX, R, T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=-1)[0]
+CHAIN_R1 = cv2.stereoRectify(M1, D2, M2, D2, SIZE_PX, R, T[:, None], flags=cv2.CALIB_ZERO_DISPARITY, alpha=-1)[0]
 CAMERA_FROM_IMU = exp_twist([0.1, -0.2, 0.3, 1.2, -0.7, 2.0]).as_matrix()
 
 

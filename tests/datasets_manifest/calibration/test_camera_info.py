@@ -11,6 +11,7 @@ import pytest
 
 from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
 from geometry.stereo import EYES
+from tests.support.stereo_calibrations import opencv_ideal_px
 
 SIZE_PX = (1280, 960)
 M1 = np.array([[2140.0, 0, 650.0], [0, 2138.0, 470.0], [0, 0, 1]])
@@ -18,12 +19,11 @@ M2 = np.array([[2129.0, 0, 633.0], [0, 2131.0, 484.0], [0, 0, 1]])
 D1, D2 = np.array([-0.06, 0.02, 1e-4, -2e-4, 0.01]), np.array([-0.05, 0.01, -1e-4, 1e-4, 0.0])
 R = cv2.Rodrigues(np.array([0.003, -0.02, 0.004]))[0]
 T = np.array([-0.1203, 0.0007, -0.0011])
-ITERATIONS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
 
 
 def pair(decimals: int | None = None, flags: int = cv2.CALIB_ZERO_DISPARITY, **options: Any) -> tuple[CameraInfo, ...]:
     """What ROS's calibrator gives for the two cameras, with as many decimals as it prints."""
-    R1, R2, P1, P2, *_ = cv2.stereoRectify(M1, D1, M2, D2, SIZE_PX, R, T, flags=flags, **options)
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(M1, D1, M2, D2, SIZE_PX, R, T[:, None], flags=flags, **options)
     infos = []
     for name, D, K, rotation, P in (("left.yaml", D1, M1, R1, P1), ("right.yaml", D2, M2, R2, P2)):
         arrays = [m if decimals is None else np.round(m, decimals) for m in (D, K, rotation, P)]
@@ -48,7 +48,7 @@ def test_the_given_rectification_is_the_frame(options: dict[str, Any]) -> None:
     for eye, info, px in zip(EYES, (left, right), seen_px(POINTS_M), strict=True):
         # Double precision on both sides.
         np.testing.assert_allclose(rig.image(in_rig, eye), px, atol=1e-8)
-        rectified = cv2.undistortPointsIter(px[:, None], info.K, info.D, info.R, info.P[:, :3], ITERATIONS)[:, 0]
+        rectified = opencv_ideal_px(px, info.K, info.D, info.R, info.P[:, :3])
         if eye == "left":
             np.testing.assert_allclose(rig.ideal_px(px, eye), rectified, atol=1e-7)
         # The right rectified image may begin at another column, which is not part of the frame.

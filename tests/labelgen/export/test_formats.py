@@ -30,6 +30,7 @@ NAMES = (
     "speed",
     "kitti",
     "webdataset",
+    "huggingface",
     "parquet",
     "blind",
     "cvat",
@@ -128,7 +129,7 @@ sys.exit(run(["export", sys.argv[1], "--format", sys.argv[2], "--out", sys.argv[
 """
 
 
-@pytest.mark.parametrize("name", ["coco", "speed", "webdataset", "parquet"])
+@pytest.mark.parametrize("name", ["coco", "speed", "webdataset", "huggingface", "parquet"])
 def test_a_full_disk_is_one_line_and_leaves_nothing(
     name: str, dataset_by_preset: Callable[..., Any], tmp_path: Path
 ) -> None:

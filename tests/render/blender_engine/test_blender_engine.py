@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -36,12 +35,9 @@ from tests.support.recipe_builder import paper_view_recipe
 if TYPE_CHECKING:
     from render.blender_engine.blender_engine import BlenderEngine
 
-pytestmark = [
-    pytest.mark.blender,
-    pytest.mark.skipif(
-        importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'"
-    ),
-]
+from tests.support.blender_interpreter import needs_blender
+
+pytestmark = [pytest.mark.blender, needs_blender]
 
 LAMP_CD_M2 = 1e6
 PASSES = ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -12,13 +10,9 @@ from geometry.stereo import EYES
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.render.golden_frame import GOLDEN, golden_recipe
+from tests.support.blender_interpreter import needs_blender
 
-pytestmark = [
-    pytest.mark.blender,
-    pytest.mark.skipif(
-        importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'"
-    ),
-]
+pytestmark = [pytest.mark.blender, needs_blender]
 
 RENDERS = 8
 RENDER = {"engine": "blender", "samples_per_px": 16, "surround_samples_per_px": 16}

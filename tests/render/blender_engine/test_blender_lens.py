@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,10 @@ from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from render.engine import RenderEngine, StereoRadiance
 from scenes.sampler import sample_frame
+from tests.support.blender_interpreter import needs_blender
 from tests.support.recipe_builder import build_recipe, stations
 
-pytestmark = [
-    pytest.mark.blender,
-    pytest.mark.skipif(
-        importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'"
-    ),
-]
+pytestmark = [pytest.mark.blender, needs_blender]
 
 
 @pytest.fixture(scope="module")

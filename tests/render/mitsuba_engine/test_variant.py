@@ -57,6 +57,17 @@ def driver(folder: Path, init: int = 0, count: int = 1, major: int = 8) -> str:
     return str(library)
 
 
+def test_a_user_without_a_home_has_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        # As `Path.home` where HOME is not set and the user has no entry in the system's list.
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", no_home)
+    variant._store_verdict("key", True)
+    assert variant._verdicts() == {}
+
+
 def refusal() -> str:
     with pytest.raises(EngineUnavailableError) as caught:
         engine_notice("mitsuba", "cuda")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from studies.engine_agreement.navigation_agreement import (
     size_ratios,
     station_recipe,
 )
+from tests.support.blender_interpreter import needs_blender
 from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 from tests.support.small_datasets import rendered
 
@@ -121,7 +121,7 @@ def test_datasets_of_other_frames_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.mitsuba
 @pytest.mark.blender
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'")
+@needs_blender
 def test_both_engines_make_datasets_of_one_truth(tmp_path: Path) -> None:
     one, other = (Dataset(small_dataset(tmp_path / name, name)).record(0) for name in ("mitsuba", "blender"))
     assert (one.engine, other.engine) == ("mitsuba", "blender")

@@ -5,12 +5,10 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import rerun as rr
 
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.reader import Dataset
@@ -18,6 +16,7 @@ from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, wri
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform, rotation_from_angles
 from tests.support.recipe_builder import recipe_text
+from tests.support.rerun_files import entities, shown_values, static_value, values
 from tests.support.small_datasets import SINGLE_PAIRS, docking_recipe, rendered
 
 MANY_EMPTY = recipe_text(SINGLE_PAIRS, seed=3, frames={"count": 8, "empty_fraction": 0.4})
@@ -49,15 +48,6 @@ def estimates(docking: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def read(path: Path, entity: str, component: str) -> dict[int, Any]:
-    """Values of a component by frame; frames without one are left out."""
-    view = rr.dataframe.load_recording(path).view(index="frame", contents=entity)
-    table = view.select().read_all()
-    (column,) = [column for column in table.column_names if column.endswith(f":{component}")]
-    pairs = zip(table.column("frame").to_pylist(), table.column(column).to_pylist(), strict=True)
-    return {frame: value for frame, value in pairs if value}
-
-
 @pytest.fixture(scope="module")
 def recording(docking: Path, estimates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "new" / "a.rrd"
@@ -68,23 +58,20 @@ def recording(docking: Path, estimates: Path, tmp_path_factory: pytest.TempPathF
 
 def entity_of_method(path: Path, before: str) -> str:
     """However rerun writes a name with signs in it."""
-    schema = rr.dataframe.load_recording(path).schema().component_columns()
-    below = {column.entity_path for column in schema if column.entity_path.startswith(before)}
+    below = {entity for entity in entities(path) if entity.startswith(before)}
     (found,) = {entity for entity in below if not entity.endswith("/body")}
-    return str(found)
+    return found
 
 
 def static(path: Path, entity: str, component: str) -> np.ndarray:
     """What does not change."""
-    table = rr.dataframe.load_recording(path).view(index="frame", contents=entity).select_static().read_all()
-    (column,) = [column for column in table.column_names if column.endswith(f":{component}")]
-    return np.array(table.column(column).to_pylist()[0][0], dtype=float)
+    return np.array(static_value(path, entity, component), dtype=float)
 
 
 def test_true_and_estimated_poses_are_those_of_the_files(docking: Path, recording: Path) -> None:
     dataset = Dataset(docking)
-    poses = read(recording, "/rig/drogue", "Translation3D"), read(recording, "/rig/drogue", "TransformMat3x3")
-    estimated = read(recording, entity_of_method(recording, "/rig/estimates/"), "Translation3D")
+    poses = values(recording, "/rig/drogue", "Translation3D"), values(recording, "/rig/drogue", "TransformMat3x3")
+    estimated = values(recording, entity_of_method(recording, "/rig/estimates/"), "Translation3D")
     assert sorted(poses[0]) == list(dataset.frame_indices)
     for index in dataset.frame_indices:
         pose = dataset.record(index).left_from_drogue
@@ -95,7 +82,7 @@ def test_true_and_estimated_poses_are_those_of_the_files(docking: Path, recordin
             np.testing.assert_allclose(estimated[index][0], pose.translation_m + OFFSET_M, rtol=1e-6)
     assert LOST not in estimated
     # Where there is no fix nothing is shown, and then the drogue's circles are sent again.
-    circles = read(recording, entity_of_method(recording, "/rig/estimates/") + "/body", "LineStrip3D")
+    circles = values(recording, entity_of_method(recording, "/rig/estimates/") + "/body", "LineStrip3D")
     assert sorted(circles) == [0, 4]
     rim = np.array(circles[0][0])
     radius_m = dataset.record(0).frame.drogue.rim_radius_m
@@ -106,18 +93,18 @@ def test_true_and_estimated_poses_are_those_of_the_files(docking: Path, recordin
 
 def test_curves_are_the_errors_and_stop_where_there_is_no_fix(recording: Path) -> None:
     for curve, wanted in (("position_mm", 5.0), ("pitch_deg", 0.0), ("yaw_deg", TURN_DEG)):
-        values = read(recording, entity_of_method(recording, f"/errors/{curve}/"), "Scalar")
-        assert sorted(values) == [0, 1, 2, 4, 5]
+        curve_values = values(recording, entity_of_method(recording, f"/errors/{curve}/"), "Scalar")
+        assert sorted(curve_values) == [0, 1, 2, 4, 5]
         # Poses are rounded nowhere: what is left is floating point.
-        np.testing.assert_allclose([value[0] for value in values.values()], wanted, atol=1e-6)
+        np.testing.assert_allclose([value[0] for value in curve_values.values()], wanted, atol=1e-6)
 
 
 def test_boxes_and_markers_count_from_the_corner_of_the_image(docking: Path, recording: Path) -> None:
     dataset = Dataset(docking)
     for eye in ("left", "right"):
-        centers = read(recording, f"/rig/{eye}/box_full", "Position2D")
-        halves = read(recording, f"/rig/{eye}/box_full", "HalfSize2D")
-        markers = read(recording, f"/rig/{eye}/markers", "Position2D")
+        centers = values(recording, f"/rig/{eye}/box_full", "Position2D")
+        halves = values(recording, f"/rig/{eye}/box_full", "HalfSize2D")
+        markers = values(recording, f"/rig/{eye}/markers", "Position2D")
         for index in dataset.frame_indices:
             view = getattr(dataset.record(index).views, eye)
             x, y, width, height = view.box_full_xywh_px
@@ -131,7 +118,7 @@ def test_boxes_and_markers_count_from_the_corner_of_the_image(docking: Path, rec
 def test_the_pinholes_project_the_mesh_to_the_box(docking: Path, recording: Path) -> None:
     record = Dataset(docking).record(0)
     # The mesh is sent once for as long as the drogue is there.
-    (vertices,) = read(recording, "/rig/drogue/body", "Position3D").values()
+    (vertices,) = values(recording, "/rig/drogue/body", "Position3D").values()
     points = record.left_from_drogue.apply(np.array(vertices))
     for eye, view in (("left", record.views.left), ("right", record.views.right)):
         matrix = static(recording, f"/rig/{eye}", "PinholeProjection").reshape(3, 3).T
@@ -144,7 +131,7 @@ def test_the_pinholes_project_the_mesh_to_the_box(docking: Path, recording: Path
 
 
 def test_images_are_there(docking: Path, recording: Path) -> None:
-    images = read(recording, "/rig/right/image", "Blob")
+    images = values(recording, "/rig/right/image", "Blob")
     assert len(images) == 6
     picture = cv2.imdecode(np.array(images[0][0], dtype=np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (120, 160, 3)
@@ -158,7 +145,7 @@ def test_a_part_and_a_damaged_pair(docking: Path, tmp_path: Path, capsys: pytest
     assert run(["view", str(damaged), "--frames", "1:4", "--save", str(out)]) == FAULT
     heard = capsys.readouterr()
     assert f"frame 2 is left out: {image}" in heard.err and heard.out == f"wrote {out}: 2 pairs\n"
-    assert sorted(read(out, "/rig/left/image", "Blob")) == [1, 3]
+    assert sorted(values(out, "/rig/left/image", "Blob")) == [1, 3]
 
 
 def test_without_a_pair_to_show_nothing_is_written(
@@ -182,14 +169,8 @@ def test_the_distance_stops_where_there_is_no_drogue(tmp_path: Path) -> None:
     truth = {index: dataset.record(index).conditions.distance_m for index in dataset.frame_indices}
     there = {index: distance_m for index, distance_m in truth.items() if distance_m is not None}
     assert 0 < len(there) < 8
-    # What the viewer shows at a frame: the value that was told last, unless it was taken back.
-    view = rr.dataframe.load_recording(out).view(index="frame", contents="/distance_m")
-    indices = np.array(dataset.frame_indices, dtype=np.int64)
-    table = view.using_index_values(indices).fill_latest_at().select().read_all()
-    (column,) = [column for column in table.column_names if column.endswith(":Scalar")]
-    values = zip(table.column("frame").to_pylist(), table.column(column).to_pylist(), strict=True)
-    found = {index: value[0] for index, value in values if value}
-    assert found == pytest.approx(there)
+    shown = shown_values(out, "/distance_m", "Scalar", dataset.frame_indices)
+    assert {index: value[0] for index, value in shown.items()} == pytest.approx(there)
 
 
 def test_frames_that_the_dataset_lacks_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,9 +194,9 @@ def test_pairs_without_truth(docking: Path, estimates: Path, tmp_path: Path) -> 
     blind, out = tmp_path / "blind", tmp_path / "a.rrd"
     assert run(["export", str(docking), "--format", "blind", "--out", str(blind)]) == DONE
     assert run(["view", str(blind), "--estimates", str(estimates), "--save", str(out)]) == DONE
-    entities = {column.entity_path for column in rr.dataframe.load_recording(out).schema().component_columns()}
-    assert "/rig/left/image" in entities and "/rig/drogue" not in entities
-    assert sorted(read(out, entity_of_method(out, "/rig/estimates/"), "Translation3D")) == [0, 1, 2, 4, 5]
+    held = entities(out)
+    assert "/rig/left/image" in held and "/rig/drogue" not in held
+    assert sorted(values(out, entity_of_method(out, "/rig/estimates/"), "Translation3D")) == [0, 1, 2, 4, 5]
 
 
 def test_wrong_orders_are_refused_on_one_line(
