@@ -14,7 +14,7 @@ from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters
 from drogue_models.surroundings.hose_look import HoseLook
-from drogue_models.tankers.parameters import Tanker
+from drogue_models.tankers.tanker import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene

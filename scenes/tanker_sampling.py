@@ -10,7 +10,7 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.tanker_ranges import TankerRanges
 from drogue_models.parameters import DrogueParameters
-from drogue_models.tankers.parameters import PROPELLERS, Tanker
+from drogue_models.tankers.tanker import PROPELLERS, Tanker
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
 from scenes.flight.suspension import HOSE_NODES, HOSE_OVERLAP_M, WORLD_FROM_TANKER

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
-from drogue_models.tankers.parameters import STATIONS, PaintScheme, PodLight, Station, TankerType
+from drogue_models.tankers.tanker import STATIONS, PaintScheme, PodLight, Station, TankerType
 
 LONGEST_LINE_M = 5.0
 

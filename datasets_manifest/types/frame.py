@@ -15,7 +15,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import MAX_NEIGHBOURS
 from drogue_models.surroundings.hose_look import HoseLook
-from drogue_models.tankers.parameters import Tanker
+from drogue_models.tankers.tanker import Tanker
 from geometry.se3 import RigidTransform, exp_twist
 
 DropoutKind = Literal["occlusion", "out-of-view", "glare"]

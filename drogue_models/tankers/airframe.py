@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from drogue_models.tankers.airframe_grids import SurfaceGrid, WingStation, tapered
 from drogue_models.tankers.equipment import Rotor, pod, pylon
-from drogue_models.tankers.parameters import Station
+from drogue_models.tankers.tanker import Station
 
 Place = tuple[float, float, float]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drogue_models.frozen_model import ReflectanceRgb
-from drogue_models.tankers.parameters import PaintScheme
+from drogue_models.tankers.tanker import PaintScheme
 
 
 @dataclass(frozen=True)

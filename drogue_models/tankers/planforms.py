@@ -15,8 +15,8 @@ from drogue_models.tankers.airframe import Airframe
 from drogue_models.tankers.airframe_grids import SurfaceGrid
 from drogue_models.tankers.combat_aircraft import fighter, unmanned
 from drogue_models.tankers.jet_transports import four_jet, twin_jet_high_wing, twin_jet_wide
-from drogue_models.tankers.parameters import TankerType
 from drogue_models.tankers.propeller_aircraft import four_turboprop, multirotor, tilt_rotor
+from drogue_models.tankers.tanker import TankerType
 from geometry.se3 import Array
 
 _BUILDERS: dict[TankerType, Callable[[float], Airframe]] = {

@@ -14,8 +14,8 @@ from drogue_models.tankers.airframe import Place
 from drogue_models.tankers.atlas import Chart, lay_out
 from drogue_models.tankers.equipment import POD_TAIL_RADIUS_M, TUNNEL_RADIUS_M, lamp_mesh, rotor_mesh
 from drogue_models.tankers.paint_schemes import SCHEMES
-from drogue_models.tankers.parameters import PaintScheme, Tanker, TankerType
 from drogue_models.tankers.planforms import airframe, joined_mesh
+from drogue_models.tankers.tanker import PaintScheme, Tanker, TankerType
 from geometry.se3 import Array
 
 _RED, _GREEN, _WHITE, _AMBER = (1.0, 0.04, 0.02), (0.03, 1.0, 0.25), (1.0, 0.95, 0.85), (1.0, 0.45, 0.02)

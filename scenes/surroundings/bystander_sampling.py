@@ -9,7 +9,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import Obstacle
 from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import PLAIN_FORMS, ObstacleShape
-from drogue_models.tankers.parameters import Tanker
+from drogue_models.tankers.tanker import Tanker
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from drogue_models.tankers.wing_with_pod import wing_surfaces
 from geometry.se3 import RigidTransform

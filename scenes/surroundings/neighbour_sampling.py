@@ -13,7 +13,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition
 from datasets_manifest.types.neighbours import OtherDrogue
 from drogue_models.parameters import DrogueParameters
-from drogue_models.tankers.parameters import Tanker
+from drogue_models.tankers.tanker import Tanker
 from drogue_models.tankers.wing_with_pod import pod_exit_m
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drogue_models.presets import PRESETS
-from drogue_models.tankers.parameters import STATIONS
+from drogue_models.tankers.tanker import STATIONS
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
-from drogue_models.tankers.parameters import Tanker
+from drogue_models.tankers.tanker import Tanker
 from scenes.sampler import sample_frame
 from scenes.tanker_sampling import tanker_at, tanker_of_scene
 from tests.support.recipe_builder import RecipeTable, between, build_recipe

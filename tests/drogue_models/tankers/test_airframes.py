@@ -9,8 +9,8 @@ import trimesh
 
 from drogue_models.tankers.airframe import Airframe, SourceDimension
 from drogue_models.tankers.equipment import rotor_mesh
-from drogue_models.tankers.parameters import PROPELLERS, STATIONS, Tanker, TankerType
 from drogue_models.tankers.planforms import airframe, grid_mesh
+from drogue_models.tankers.tanker import PROPELLERS, STATIONS, Tanker, TankerType
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import between, build_recipe

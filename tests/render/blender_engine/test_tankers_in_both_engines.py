@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 
 from datasets_manifest.recipe.recipe import RenderSettings
 from drogue_models.parts import Part
-from drogue_models.tankers.parameters import PROPELLERS, STATIONS
+from drogue_models.tankers.tanker import PROPELLERS, STATIONS
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
