@@ -114,7 +114,7 @@ class DrogueParameters(FrozenModel):
         canopy_reflectance_rgb: of the drag canopy: cloth, leaves or cone.
         structure_reflectance_rgb: of ribs, coupling and hose.
         hub: the hub feature, or none.
-        rib_count: struts between rim and coupling; leaves or straps of a body that has these.
+        rib_count: struts between rim and coupling; leaves or straps of a body that has these (a cone has none).
         coupling_radius_m: of the body behind the hub face. [m]
         coupling_length_m: of the body behind the hub face. [m]
         hose_radius_m: [m]
@@ -201,6 +201,10 @@ class DrogueParameters(FrozenModel):
         if self.marker_depths_m and len(self.marker_depths_m) != self.marker_count:
             raise ValueError(f"marker_depths_m: must be one for each of the {self.marker_count} markers, or none")
         _check_coupling(self, body)
+        if body.lamps is not None:
+            ring_m, lamp_m = self._lamp_ring_m(body.lamps.radius_m), body.lamps.radius_m
+            if (body.lamps.count > 1 and ring_m * math.sin(math.pi / body.lamps.count) <= lamp_m) or ring_m <= 0:
+                raise ValueError("body.lamps: do not fit side by side inside the rim; lower count or radius_m")
         for index, (x, y, depth) in enumerate(self.marker_centers_m):
             distance, reach = math.hypot(x, y), self.marker_radius_m + HOLDER_BORDER_M
             back_m = depth + HOLDER_THICKNESS_M
@@ -284,7 +288,10 @@ class DrogueParameters(FrozenModel):
         lamps = None if self.body is None else self.body.lamps
         if lamps is None:
             return ()
-        return even_ring(lamps.count, self.inner_radius_m(2 * lamps.radius_m) - lamps.radius_m - _CLEARANCE_M)
+        return even_ring(lamps.count, self._lamp_ring_m(lamps.radius_m))
+
+    def _lamp_ring_m(self, lamp_radius_m: float) -> float:
+        return self.inner_radius_m(2 * lamp_radius_m) - lamp_radius_m - _CLEARANCE_M
 
 
 def _check_coupling(drogue: DrogueParameters, body: DrogueBody) -> None:

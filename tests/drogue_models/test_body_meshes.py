@@ -189,6 +189,14 @@ def test_markers_lie_at_their_depths_and_fill_their_holders() -> None:
         ({"body": BasketBody(coupling={"guide_length_m": 0.19})}, "body.coupling.guide_length_m: must be below"),
         ({"body": BasketBody(depth_m=0.02)}, "body.depth_m: must exceed"),
         ({"body": BasketBody(lamps={"count": 6})}, "marker_positions_m: marker 0 overlaps a lamp"),
+        (
+            {
+                "body": BasketBody(lamps={"count": 48, "radius_m": 0.025}),
+                "marker_positions_m": (),
+                "marker_depths_m": (),
+            },
+            "body.lamps: do not fit side by side",
+        ),
         ({"body_mesh": {"path": "x.ply", "sha256": "0" * 64}}, "body: leave it out, or leave out body_mesh"),
     ],
 )
