@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import io
 import os
+import re
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,25 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every program that they start with them.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+_TORCH = r"torch|nav\.training|nav\.detector\.network|droguekit\.torch|tests\.support\.detector_networks"
+IMPORTS_TORCH = re.compile(rf"^(import|from) ({_TORCH})\b", re.MULTILINE)
+
+
+class TorchModule(pytest.Module):
+    """A module of tests that cannot be imported where torch is missing."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Skip it all, with the reason."""
+        pytest.skip("torch is missing: pip install 'droguekit[train]'", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+    """Skip the tests that import torch where it is missing."""
+    if importlib.util.find_spec("torch") is None and IMPORTS_TORCH.search(module_path.read_text(encoding="utf-8")):
+        return TorchModule.from_parent(parent, path=module_path)
+    return None
+
 
 RENDERED_FIXTURES = {"smoke_dataset", "tiny_dataset"}
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import tarfile
+from contextlib import ExitStack
 from pathlib import Path
 
 from datasets_manifest.atomic import new_folder
@@ -40,16 +41,14 @@ def write_webdataset(dataset: Location, out: Path, log: ExportLog, shard_bytes: 
     source = Dataset(dataset)
     splits = source.manifest.split_of_frame()
     writers: dict[str, _Shards] = {}
-    with new_folder(out) as folder:
+    # All shards are closed, even where closing one fails on a full disk.
+    with new_folder(out) as folder, ExitStack() as open_shards:
         for split in sorted(set(splits.values())):
             writers[split] = _Shards(folder, split, shard_bytes)
-        try:
-            for record in log.records(source):
-                split = splits[record.frame_index]
-                writers[split].add(_sample(source, record, split))
-        finally:
-            for writer in writers.values():
-                writer.close()
+            open_shards.callback(writers[split].close)
+        for record in log.records(source):
+            split = splits[record.frame_index]
+            writers[split].add(_sample(source, record, split))
     return [out / name for split in sorted(writers) for name in writers[split].names]
 
 
