@@ -13,7 +13,7 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.tankers.tanker import PROPELLERS, Tanker
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.flight.suspension import HOSE_NODES, HOSE_OVERLAP_M, WORLD_FROM_TANKER
+from scenes.flight.suspension import HOSE_NODES, WORLD_FROM_TANKER, hose_tail_m
 
 _FLAP_STEP_DEG = 5.0
 _SWEEP_STEPS = 12
@@ -90,8 +90,7 @@ def hang_line(
     drop, side = np.radians(drop_deg), np.radians(rng.uniform(-_LINE_SPREAD_DEG, _LINE_SPREAD_DEG))
     ahead = np.array([np.cos(drop) * np.cos(side), np.cos(drop) * np.sin(side), np.sin(drop)])
     left_from_world = world_from_left.inverse()
-    tail_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
-    tail = left_from_drogue.apply([0.0, 0.0, tail_m])
+    tail = left_from_drogue.apply([0.0, 0.0, hose_tail_m(drogue)])
     belly = tail + length_m * left_from_world.rotate(ahead)
     # A stiff line leaves the coupling along the drogue's axis and bends towards the belly.
     bend = tail + 0.35 * length_m * left_from_drogue.rotation[:, 2]

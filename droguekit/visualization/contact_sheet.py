@@ -185,6 +185,8 @@ def _draw_tile(images: StereoImages, record: PairRecord, width_px: int) -> Pictu
     view = record.views.left
     if view.box_full_xywh_px is not None:
         draw_box(picture, view.box_full_xywh_px, scale)
+    for other in view.neighbours:
+        draw_box(picture, other.box_full_xywh_px, scale)
     draw_crosses(picture, [marker.center_ellipse_px for marker in view.markers], scale)
     if view.hub is not None and view.hub.visible_fraction > 0:
         draw_crosses(picture, [view.hub.center_ellipse_px], scale, color=_HUB_RGB)

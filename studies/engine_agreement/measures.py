@@ -13,7 +13,7 @@ from datasets_manifest.recipe.recipe import Recipe, RenderSettings, load_recipe
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
-from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP, Part, drogue_part_ids
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, Eye
@@ -151,7 +151,9 @@ def _part_sums(both: list[tuple[EyeRadiance, EyeRadiance]]) -> dict[str, tuple[i
         for part in np.unique(a.part_id):
             if part == Part.SKY:
                 continue
-            name = MARKERS if part >= FIRST_MARKER_ID else Part(part).name.lower()
+            # Parts of other drogues count with those of the sought one.
+            own = int(part) % INSTANCE_STEP
+            name = MARKERS if own >= FIRST_MARKER_ID else Part(own).name.lower()
             same = (a.part_id == part) & (b.part_id == part)
             count, one, other = sums.get(name, (0, 0.0, 0.0))
             sums[name] = count + int(same.sum()), one + values[0][same].sum(), other + values[1][same].sum()
