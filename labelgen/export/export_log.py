@@ -124,6 +124,14 @@ def _view_fault(record: PairRecord, view: ViewRecord) -> str | None:
         return "box_visible_xywh_px: must be given exactly when pixels of a drogue are visible"
     if view.box_visible_xywh_px is not None and not _is_pixels(view.box_visible_xywh_px, camera):
         return f"box_visible_xywh_px: must be around whole pixels of the image, got {view.box_visible_xywh_px}"
+    if len(view.neighbours) != len(record.frame.neighbours):
+        return f"neighbours: must be {len(record.frame.neighbours)} as in the frame, got {len(view.neighbours)}"
+    for index, other in enumerate(view.neighbours):
+        box = other.box_visible_xywh_px
+        if (box is None) != (other.visible_drogue_px == 0):
+            return f"neighbours[{index}].box_visible_xywh_px: must be given exactly when pixels of it are visible"
+        if box is not None and not _is_pixels(box, camera):
+            return f"neighbours[{index}].box_visible_xywh_px: must be around whole pixels of the image, got {box}"
     if view.visible_drogue_px > camera.width_px * camera.height_px:
         return f"visible_drogue_px: is more than the image has, got {view.visible_drogue_px}"
     return None

@@ -341,7 +341,7 @@ def coco_neighbours(
     their keypoints are absent.
 
     Raises:
-        ValueError: the frame's index is too large for ids of 32 bits.
+        ValueError: the frame's index is too large for ids of 32 bits, or the part ids show no pixel of one.
     """
     view, entries = view_of(record, eye), []
     for index, (seen, other) in enumerate(zip(view.neighbours, record.frame.neighbours, strict=True)):
@@ -376,9 +376,18 @@ def coco_neighbours(
 
 
 def neighbour_pixels(record: PairRecord, index: int, box: PixelBox, part_id: NDArray[np.uint8]) -> MaskPixels:
-    """Mask of a drogue beside the sought one, within its visible box in one eye's image."""
-    count = record.frame.neighbours[index].drogue.marker_count
-    return DroguePixels(part_id, box, count, index + 1).drogue()
+    """Mask of a drogue beside the sought one, within its visible box in one eye's image.
+
+    Raises:
+        ValueError: there are no pixels of it.
+    """
+    pixels = DroguePixels(part_id, box, record.frame.neighbours[index].drogue.marker_count, index + 1).drogue()
+    if not len(pixels):
+        raise ValueError(
+            f"frame {record.frame_index}: no pixel shows the drogue of neighbours[{index}] in its visible box; run "
+            "droguekit validate"
+        )
+    return pixels
 
 
 def _small_image_id(record: PairRecord, eye: Eye) -> int:
