@@ -132,6 +132,22 @@ def pylon(
     return lifting_surface("pylon", stations, points=28, round_tip=False, mirrored=mirrored)
 
 
+def stowed_drogue() -> SurfaceGrid:
+    """What shows of a drogue that is drawn into its tunnel, in the axes of `pod`: the folded canopy's lip and cone."""
+    rubber = Finish.RUBBER
+    profile = [
+        (-0.62, 0.0, rubber),
+        (-0.62, 0.09, rubber),
+        (-0.10, 0.12, rubber),
+        (0.04, 0.155, rubber),
+        (0.055, 0.150, rubber),
+        (0.04, 0.140, rubber),
+        (-0.25, 0.055, rubber),
+        (-0.25, 0.0, rubber),
+    ]
+    return revolved("stowed-drogue", profile, 32)
+
+
 @dataclass(frozen=True)
 class Rotor:
     """A propeller or rotor.

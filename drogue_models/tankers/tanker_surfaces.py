@@ -12,9 +12,9 @@ from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.tankers.aircraft_paint import paint_aircraft
 from drogue_models.tankers.airframe import Place
 from drogue_models.tankers.atlas import Chart, lay_out
-from drogue_models.tankers.equipment import POD_TAIL_RADIUS_M, TUNNEL_RADIUS_M, lamp_mesh, rotor_mesh
+from drogue_models.tankers.equipment import POD_TAIL_RADIUS_M, TUNNEL_RADIUS_M, lamp_mesh, rotor_mesh, stowed_drogue
 from drogue_models.tankers.paint_schemes import SCHEMES
-from drogue_models.tankers.planforms import airframe, joined_mesh
+from drogue_models.tankers.planforms import airframe, grid_mesh, joined_mesh
 from drogue_models.tankers.tanker import PaintScheme, Tanker, TankerType
 from geometry.se3 import Array
 
@@ -26,10 +26,11 @@ _POD_LUMINANCE_CD_M2 = 2500.0
 _POD_LAMP_RADIUS_M = 0.028
 _BLADE_RGB: dict[TankerType, tuple[float, float, float]] = {"multirotor": (0.035, 0.035, 0.037)}
 _OTHER_BLADE_RGB = (0.055, 0.056, 0.058)
+_CANOPY_RGB = (0.14, 0.14, 0.13)  # of a drogue that is drawn in: grey cloth, a little soiled (our choice)
 
 
 def tanker_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
-    """All surfaces of a tanker in its frame; the airframe comes first, then lamps and propellers. [m]"""
+    """All surfaces of a tanker in its frame: the airframe, drawn-in drogues, lamps and propellers. [m]"""
     return (
         *_fixed_surfaces(tanker.model_copy(update={"blade_phase_deg": 0.0, "blade_sweep_deg": 0.0})),
         *_blades(tanker),
@@ -44,7 +45,7 @@ def _fixed_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
     mesh, uv = _airframe_mesh(tanker.type, tanker.flaps_deg)
     moved = trimesh.Trimesh(mesh.vertices + origin, mesh.faces, vertex_normals=mesh.vertex_normals, process=False)
     paint = _paint(tanker.type, tanker.flaps_deg, tanker.paint, tanker.seed)
-    return (PaintedMesh(moved, paint, uv, smooth=True), *_lamps(tanker, origin))
+    return (PaintedMesh(moved, paint, uv, smooth=True), *_stowed_drogues(tanker, origin), *_lamps(tanker, origin))
 
 
 @lru_cache(maxsize=48)
@@ -61,6 +62,17 @@ def _airframe_mesh(tanker_type: TankerType, flaps_deg: float) -> tuple[trimesh.T
 def _paint(tanker_type: TankerType, flaps_deg: float, paint: PaintScheme, seed: int) -> NDArray[np.float32]:
     frame = airframe(tanker_type, flaps_deg)
     return paint_aircraft(frame, _charts(tanker_type, flaps_deg), SCHEMES[paint], seed)
+
+
+def _stowed_drogues(tanker: Tanker, origin: Array) -> list[PaintedMesh]:
+    """Drogues at the stations that are not in use."""
+    exits = airframe(tanker.type, tanker.flaps_deg).stations_m
+    others = [grid_mesh(stowed_drogue().moved(place)) for name, place in exits.items() if name != tanker.station]
+    if not others:
+        return []
+    mesh = trimesh.util.concatenate(others)
+    mesh.apply_translation(origin)
+    return [PaintedMesh(mesh, np.array(_CANOPY_RGB))]
 
 
 @lru_cache(maxsize=4)

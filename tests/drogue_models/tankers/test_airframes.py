@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from drogue_models.tankers.airframe import Airframe, SourceDimension
-from drogue_models.tankers.equipment import rotor_mesh
+from drogue_models.tankers.equipment import TUNNEL_DEPTH_M, TUNNEL_RADIUS_M, rotor_mesh, stowed_drogue
 from drogue_models.tankers.planforms import airframe, grid_mesh
 from drogue_models.tankers.tanker import PROPELLERS, STATIONS, Tanker, TankerType
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces
@@ -204,3 +204,15 @@ def test_silhouettes_from_behind_differ() -> None:
         overlap = (views[first] & views[second]).sum() / (views[first] | views[second]).sum()
         # At the same span; twins with pods under low and high wings overlap most.
         assert overlap < 0.75, (first, second, overlap)
+
+
+def test_drogues_that_are_not_in_use_fit_their_tunnels() -> None:
+    stowed = grid_mesh(stowed_drogue())
+    assert stowed.is_watertight and stowed.volume > 0
+    across = np.linalg.norm(np.asarray(stowed.vertices)[:, 1:], axis=1)
+    assert across.max() < TUNNEL_RADIUS_M and stowed.bounds[0, 0] > -TUNNEL_DEPTH_M
+    in_use = [
+        len(tanker_surfaces(Tanker(type=name, station=stations[0])))
+        for name, stations in (("four-jet", STATIONS["four-jet"]), ("fighter", STATIONS["fighter"]))
+    ]
+    assert in_use[0] == in_use[1] + 1
