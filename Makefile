@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow test-readers torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -36,6 +36,9 @@ test-slow: setup ## the tests that render for longer
 
 test-readers: setup ## read the exports with datasets, datumaro, evo, FiftyOne, Label Studio's SDK and ultralytics (installs them under out/readers)
 	@scripts/readers
+
+test-container: ## build the container image with buildah and try it (minutes; as root; needs buildah and debootstrap)
+	@scripts/test-container
 
 torture: setup ## kill a run of 200 pairs 50 times, and compare the result with an undisturbed run (minutes)
 	@$(BIN)/python -m pytest tests/batch -m torture --capture=no

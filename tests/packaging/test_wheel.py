@@ -77,6 +77,15 @@ def test_holds_only_our_packages_and_the_licence(wheel: Path) -> None:
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
+def test_the_container_is_built_from_what_the_wheel_is_built_from() -> None:
+    lines = (REPOSITORY / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    rules = [line for line in lines if not line.startswith("#")]
+    # Everything is left out, and then these are let in again.
+    assert rules[0] == "*"
+    let_in = {rule[1:] for rule in rules if rule.startswith("!")}
+    assert let_in == {*PACKAGES, "pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
+
+
 def test_every_data_folder_is_packaged() -> None:
     # A file that is neither code nor named in pyproject.toml would be missing from the wheel without a word.
     package_data = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
