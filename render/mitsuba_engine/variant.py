@@ -6,12 +6,15 @@ own, and the verdict is remembered per library or driver, drjit version and proc
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -176,8 +179,27 @@ def _cpu_model() -> str:
     return match.group(1) if match else platform.machine()
 
 
+def _provide_home() -> None:
+    """Give this process, and those that it starts, a home for Dr.Jit's compiled kernels where the user has none.
+
+    Dr.Jit ends the process where it cannot make the folder `.drjit` in `HOME`.
+    """
+    home = os.environ.get("HOME")
+    try:
+        if home:
+            (Path(home) / ".drjit").mkdir(exist_ok=True)
+            return
+    except OSError:
+        pass
+    folder = tempfile.mkdtemp(prefix="droguekit-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["HOME"] = folder
+
+
 def probe_variant(device: Device = "cpu") -> Variant:
     """The fastest variant that works on a device of this machine.
+
+    A user whose home cannot be written gets one for the time of this process.
 
     Raises:
         EngineUnavailableError: Mitsuba is not installed, or there is no such device that it can use.
@@ -188,6 +210,7 @@ def probe_variant(device: Device = "cpu") -> Variant:
         raise EngineUnavailableError(
             "engine mitsuba: not installed; install it with: pip install 'droguekit[mitsuba]'"
         ) from error
+    _provide_home()
     if device == "cuda":
         try:
             gpu = _gpu()

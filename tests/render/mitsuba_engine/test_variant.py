@@ -68,6 +68,21 @@ def test_a_user_without_a_home_has_no_memory(monkeypatch: pytest.MonkeyPatch) ->
     assert variant._verdicts() == {}
 
 
+@pytest.mark.parametrize("home", [None, "/proc", "/no/such/folder"])
+def test_a_home_that_cannot_be_written_does_not_stop_mitsuba(home: str | None, tmp_path: Path) -> None:
+    code = (
+        "from render.mitsuba_engine.variant import probe_variant; chosen = probe_variant(); import mitsuba; "
+        "mitsuba.set_variant(chosen.variant); print(chosen.variant)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
+    environment |= {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)}
+    if home is not None:
+        environment["HOME"] = home
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, probe_variant().variant), done.stderr
+    assert list(tmp_path.glob("droguekit-*")) == []
+
+
 def refusal() -> str:
     with pytest.raises(EngineUnavailableError) as caught:
         engine_notice("mitsuba", "cuda")
