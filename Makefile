@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-device bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -65,6 +65,10 @@ bench-peers: ## CPU seconds per pair of droguekit, plain Cycles and plain Mitsub
 bench-scaling: ## two workers against one on 200 pairs, and the overhead per frame (minutes, on an idle machine; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.scaling --out out/scaling
+
+bench-device: ## pairs per second and watts on a GPU beside LLVM, and do they agree? (minutes, on an idle machine with a GPU)
+	@scripts/setup mitsuba
+	@$(BIN)/python -m studies.render_devices
 
 bench-feed: ## how much of its time a training waits for pairs that are rendered meanwhile (minutes, on an idle machine)
 	@scripts/setup all

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+from pathlib import Path
 from typing import Literal
 
 Device = Literal["cpu", "cuda"]
 """The processor, or an NVIDIA GPU by CUDA and OptiX."""
 DEVICES: tuple[Device, ...] = ("cpu", "cuda")
+_KERNEL_MODULE = Path("/proc/driver/nvidia/version")
 _TOOL_TIMEOUT_S = 10.0
+
+
+def kernel_module() -> str:
+    """What the driver's kernel module says of itself; empty where there is none."""
+    try:
+        return _KERNEL_MODULE.read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def driver_version() -> str | None:
+    """Version of NVIDIA's driver, such as 550.54.14; None where it is not known."""
+    found = re.search(r"Module.*?\s(\d+(?:\.\d+)+)", kernel_module())
+    return None if found is None else found.group(1)
 
 
 def query_gpu(quantity: str) -> float | None:

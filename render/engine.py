@@ -17,7 +17,7 @@ ENTRY_POINT_GROUP = "droguekit.engines"
 """Entry points of other packages for their engines: classes whose constructor takes no arguments."""
 
 _OURS = ("mitsuba", "analytic", "blender")
-_ON_GPU = ("mitsuba",)
+_ON_GPU = ("mitsuba", "blender")
 
 
 class EngineUnavailableError(ValueError):
@@ -96,6 +96,10 @@ def engine_notice(name: str, device: Device = "cpu") -> str | None:
         from render.blender_engine.interpreter import find_blender
 
         find_blender()
+        if device != "cpu":
+            from render.blender_engine.process import BlenderProcess
+
+            BlenderProcess(device=device).close()
     if name != "mitsuba":
         return None
     from render.mitsuba_engine.variant import probe_variant
@@ -137,7 +141,7 @@ def load_engine(name: str, device: Device = "cpu") -> RenderEngine:
     if name == "blender":
         from render.blender_engine.blender_engine import BlenderEngine
 
-        return BlenderEngine()
+        return BlenderEngine(device)
     from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
 
     return MitsubaEngine(device)

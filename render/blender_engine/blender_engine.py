@@ -34,6 +34,7 @@ from render.blender_engine.process import (
 )
 from render.blender_engine.stage import Stage
 from render.compositing import TracedEye, amodal_counts
+from render.device import Device, driver_version
 from render.engine import EyeRadiance, StereoRadiance
 from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
@@ -74,20 +75,24 @@ class _HalfDifference:
 
 
 class BlenderEngine:
-    """Path tracing by Cycles on the CPU, in image windows that hold drogue, hose and tanker; all else is background.
+    """Path tracing by Cycles, in image windows that hold drogue, hose and tanker; all else is background.
 
     One engine holds one Blender process.
 
     Raises:
+        EngineUnavailableError: Cycles cannot use the device.
         ValueError: Blender is not installed or cannot be loaded.
     """
 
     name = "blender"
 
-    def __init__(self) -> None:
-        self._stage = Stage()
-        self._process = BlenderProcess()
-        self.version = f"blender {self._process.version} cycles cpu, render version {RENDER_VERSION}"
+    def __init__(self, device: Device = "cpu") -> None:
+        self._stage, self._device = Stage(), device
+        self._process = BlenderProcess(device=device)
+        gpu = self._process.gpu
+        # Pixels depend on the GPU and its driver too.
+        by = "cpu" if gpu is None else f"optix ({gpu}, driver {driver_version() or 'unknown'})"
+        self.version = f"blender {self._process.version} cycles {by}, render version {RENDER_VERSION}"
         self._stage_s: dict[str, float] = {}
 
     def close(self) -> None:
@@ -116,7 +121,7 @@ class BlenderEngine:
         except BlenderEndedError:
             # A process that the system has killed is started again once.
             self._process.close()
-            self._process = BlenderProcess()
+            self._process = BlenderProcess(device=self._device)
             self._stage.forget()
             try:
                 traced, half_differences = self._trace(frame, settings, ambient)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from render.blender_engine.interpreter import OLDEST_BLENDER, BlenderInterpreter, find_blender
 from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow, PictureRequest, pickled
+from render.device import Device
+from render.engine import EngineUnavailableError
 
 _MEMORY_FOLDER = Path("/dev/shm")
 _GRACE_S = 5.0
@@ -34,23 +36,26 @@ class BlenderProcess:
 
     Args:
         interpreter: that runs it; by default the one that `find_blender` finds.
+        device: that Cycles renders on.
 
     Attributes:
         folder: for pictures; in memory where the system allows it.
         version: Blender's, such as 5.0.1.
+        gpu: name of the GPU that Cycles renders on, None on the processor.
         start_cpu_s: CPU time of its start. [s]
 
     Raises:
+        EngineUnavailableError: Cycles finds no such device.
         ValueError: Blender cannot be loaded; the message says what is missing.
     """
 
-    def __init__(self, interpreter: BlenderInterpreter | None = None) -> None:
+    def __init__(self, interpreter: BlenderInterpreter | None = None, device: Device = "cpu") -> None:
         chosen = find_blender() if interpreter is None else interpreter
         in_memory = _MEMORY_FOLDER.is_dir() and os.access(_MEMORY_FOLDER, os.W_OK)
         self.folder = Path(tempfile.mkdtemp(prefix="droguekit-blender-", dir=_MEMORY_FOLDER if in_memory else None))
         self._log = self.folder / "log.txt"
         try:
-            self._process, self._answers = _start(chosen, self.folder, self._log)
+            self._process, self._answers = _start(chosen, self.folder, self._log, device)
         except (OSError, ValueError) as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise ValueError(f"engine blender: {error}") from error
@@ -63,7 +68,12 @@ class BlenderProcess:
                 f"engine blender: cannot be loaded by {chosen.path} ({chosen.origin}): {error}; "
                 "droguekit doctor says more"
             ) from error
-        self.version = str(hello["blender"])
+        self.version, self.gpu = str(hello["blender"]), hello["gpu"]
+        if device == "cuda" and self.gpu is None:
+            self.close()
+            raise EngineUnavailableError(
+                "device cuda: Blender finds no GPU for OptiX; droguekit doctor says what is missing, or take device cpu"
+            )
         self.start_cpu_s = float(hello["cpu_s"])
 
     def ask(self, request: FrameSetup | PictureRequest) -> float:
@@ -106,7 +116,9 @@ class BlenderProcess:
         return f"the process ended with status {status}" + (f": {lines[-1].strip()}" if lines else "")
 
 
-def _start(interpreter: BlenderInterpreter, folder: Path, log: Path) -> tuple[subprocess.Popen[bytes], BinaryIO]:
+def _start(
+    interpreter: BlenderInterpreter, folder: Path, log: Path, device: Device
+) -> tuple[subprocess.Popen[bytes], BinaryIO]:
     """The process and its answers, which have a pipe of their own: Blender prints on its standard output."""
     # The other interpreter must find our modules, and none of the packages that are installed beside them.
     sources = folder / "sources"
@@ -115,7 +127,8 @@ def _start(interpreter: BlenderInterpreter, folder: Path, log: Path) -> tuple[su
     answers, write_end = os.pipe()
     code = (
         f"import sys; sys.path.insert(0, {str(sources)!r}); sys.dont_write_bytecode = True; "
-        f"from render.blender_engine.worker import main; main({str(folder)!r}, {write_end}, {OLDEST_BLENDER!r})"
+        "from render.blender_engine.worker import main; "
+        f"main({str(folder)!r}, {write_end}, {OLDEST_BLENDER!r}, {device == 'cuda'})"
     )
     try:
         with log.open("wb") as output:

@@ -29,13 +29,14 @@ def _read_requests(requests: BinaryIO, inbox: queue.SimpleQueue[FrameSetup | Pic
         os._exit(0)
 
 
-def main(folder_name: str, answers_fd: int, oldest_blender: str) -> None:
+def main(folder_name: str, answers_fd: int, oldest_blender: str, on_gpu: bool) -> None:
     """Serve one engine.
 
     Args:
         folder_name: of the folder that is removed at the end.
         answers_fd: file descriptor to answer on.
         oldest_blender: version that has all that the pictures need.
+        on_gpu: whether to render on a GPU; where there is none, the first answer says so.
     """
     folder = Path(folder_name)
     requests = os.fdopen(os.dup(0), "rb")
@@ -45,13 +46,16 @@ def main(folder_name: str, answers_fd: int, oldest_blender: str) -> None:
     threading.Thread(target=_read_requests, args=(requests, inbox, folder), daemon=True).start()
     try:
         found = _blender_version(oldest_blender)
-        from render.blender_engine.blender_scene import BlenderScene, render_picture
+        from render.blender_engine.blender_scene import BlenderScene, choose_gpu, render_picture
     except ImportError as error:
         _answer(answers, {"error": str(error)})
         return
     _ignore_signals()
     scene = BlenderScene()
-    _answer(answers, {"cpu_s": time.process_time(), "blender": found})
+    gpu = choose_gpu() if on_gpu else None
+    if gpu is not None:
+        scene.device = "GPU"
+    _answer(answers, {"cpu_s": time.process_time(), "blender": found, "gpu": gpu})
     while True:
         request, started = inbox.get(), time.process_time()
         try:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import re
-from pathlib import Path
+
+from render.device import driver_version
 
 OLDEST_DRIVER = 535
 """Of NVIDIA's driver, for the OptiX that Mitsuba calls."""
@@ -17,7 +17,6 @@ OLDEST_DRIVER = 535
 _LEAST_CAPABILITY = (7, 5)
 # CUdevice_attribute of cuda.h.
 _CAPABILITY_ATTRIBUTES = (75, 76)
-_KERNEL_MODULE = Path("/proc/driver/nvidia/version")
 
 
 def main() -> None:
@@ -85,19 +84,9 @@ def gpu_name() -> str:
     cuda.cuInit(0)
     name = ctypes.create_string_buffer(256)
     cuda.cuDeviceGetName(name, len(name), 0)
-    module = kernel_module()
-    found = re.search(r"Module.*?\s(\d+(?:\.\d+)+)", module)
-    version = _integer(cuda.cuDriverGetVersion)
-    driver = f"driver {found.group(1)}" if found else f"CUDA {version // 1000}.{version % 1000 // 10}"
-    return f"{name.value.decode(errors='replace')}, {driver}"
-
-
-def kernel_module() -> str:
-    """What the driver's kernel module says of itself; empty where there is none."""
-    try:
-        return _KERNEL_MODULE.read_text(encoding="utf-8")
-    except OSError:
-        return ""
+    driver, version = driver_version(), _integer(cuda.cuDriverGetVersion)
+    of_driver = f"driver {driver}" if driver else f"CUDA {version // 1000}.{version % 1000 // 10}"
+    return f"{name.value.decode(errors='replace')}, {of_driver}"
 
 
 def _cuda() -> ctypes.CDLL:

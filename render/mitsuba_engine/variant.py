@@ -20,9 +20,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from render.device import Device
+from render.device import Device, kernel_module
 from render.engine import EngineUnavailableError
-from render.mitsuba_engine.gpu_trial import kernel_module
 
 LLVM_REMEDY = "apt-get install libllvm19 (or another one from 17 on)"
 """Debian 12 has 19. Mitsuba 3.9.0 works with 15 too; 3.9.1 aborts the process with 15 and 16."""

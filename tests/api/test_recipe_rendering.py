@@ -70,7 +70,9 @@ def test_a_device_that_the_engine_cannot_use_is_refused_before_anything_is_made(
     pairs_recipe_file: Path, tmp_path: Path
 ) -> None:
     recipe = droguekit.load_recipe(str(pairs_recipe_file))
-    refused = "^device cuda: engine analytic renders on the processor only; take device cpu or engine mitsuba"
+    refused = (
+        "^device cuda: engine analytic renders on the processor only; take device cpu or engine mitsuba or blender"
+    )
     with pytest.raises(ValueError, match=refused):
         droguekit.render_pair(recipe, device="cuda")
     with pytest.raises(ValueError, match=refused):

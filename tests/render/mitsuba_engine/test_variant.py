@@ -111,7 +111,7 @@ def test_a_driver_that_does_not_start_is_named(tmp_path: Path, monkeypatch: pyte
 
 def test_an_old_gpu_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path, major=6))
-    monkeypatch.setattr(gpu_trial, "_KERNEL_MODULE", tmp_path / "none")
+    monkeypatch.setattr("render.device._KERNEL_MODULE", tmp_path / "none")
     assert (
         "NVIDIA Test 1" in refusal() and "has compute capability 6.5 and Mitsuba needs 7.5; take a newer" in refusal()
     )
@@ -128,7 +128,7 @@ def test_missing_optix_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_name_and_driver_of_a_gpu(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path))
     (tmp_path / "version").write_text(module)
-    monkeypatch.setattr(gpu_trial, "_KERNEL_MODULE", tmp_path / "version")
+    monkeypatch.setattr("render.device._KERNEL_MODULE", tmp_path / "version")
     assert gpu_trial.gpu_name() == f"NVIDIA Test 1, {KERNEL_MODULES[module]}"
 
 
