@@ -143,7 +143,7 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(
     # Some thirty-five neighbours' paths, nine for each, against a pixel's own four would leave a tenth; the rest is
     # blur on narrow parts, of which this small picture has many.
     assert smoothed < 0.5 * alone
-    assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * settled.mean())
+    assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * float(settled.mean()))
 
 
 @pytest.mark.parametrize("index", [0, 1])
