@@ -103,6 +103,11 @@ def _sample_body(rng: np.random.Generator, scene: DistractorScene, form: Distrac
     luminance_cd_m2 = float(np.exp(rng.uniform(low, high)))
     free = RigidTransform(_free_attitude(rng, scene, form), sample_point_in_view(rng, scene.rig, depth_m))
     place = _place_on_tanker(rng, scene, shape)
+    if place is None and scene.left_from_tanker is not None and form in (*_HANGING, *_ON_SKIN):
+        # A part of an aircraft does not fly beside one: a bird takes its place.
+        span_m = _SIZES_M["bird"][0]
+        bird = ObstacleShape(form="bird", radius_m=span_m[0] + share * (span_m[1] - span_m[0]), seed=shape.seed)
+        return Obstacle(kind="distractor", shape=bird, left_from_object=free, reflectance_rgb=_BIRD_PAINTS[0])
     return Obstacle(
         kind="distractor",
         shape=shape,
