@@ -16,7 +16,6 @@ from drogue_models.solids import loft
 from drogue_models.surroundings.painted_bodies import (
     BARE_METAL,
     COLUMNS,
-    SEMI_GLOSS,
     PaintedBody,
     banded,
     chipped,
@@ -74,7 +73,7 @@ def _nose(shape: ObstacleShape, rng: np.random.Generator, paint_rgb: Reflectance
         bands = [(0.5 * k / 4, 0.5 * k / 4 + 0.06, paint_rgb) for k in range(4)] if rng.random() < 0.3 else []
         metal = weathered(rng, 32, banded(32, (0.3, 0.3, 0.29), bands))
         bodies.append(swept(np.column_stack([np.zeros((9, 2)), steps]), radii, 24, metal))
-    return joined(bodies, SEMI_GLOSS)
+    return joined(bodies)
 
 
 def _canopy_frame(shape: ObstacleShape, rng: np.random.Generator, paint_rgb: ReflectanceRgb) -> PaintedMesh:

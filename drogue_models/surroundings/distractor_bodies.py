@@ -15,7 +15,6 @@ from drogue_models.solids import bar, loft
 from drogue_models.surroundings.painted_bodies import (
     BARE_METAL,
     COLUMNS,
-    SEMI_GLOSS,
     PaintedBody,
     banded,
     chipped,
@@ -63,8 +62,8 @@ def distractor_surface(
             bodies = _pod(shape, rng, reflectance_rgb)
         case _:
             color = np.array(reflectance_rgb)
-            return joined(_lamp(shape, rng), None, color * luminance_cd_m2 / (color @ _LUMINANCE))
-    return joined(bodies, None if shape.form in ("bird", "wheel") else SEMI_GLOSS)
+            return joined(_lamp(shape, rng), color * luminance_cd_m2 / (color @ _LUMINANCE))
+    return joined(bodies)
 
 
 def _nacelle(shape: ObstacleShape, rng: np.random.Generator, paint_rgb: ReflectanceRgb) -> list[PaintedBody]:

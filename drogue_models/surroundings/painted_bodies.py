@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from drogue_models.frozen_model import ReflectanceRgb
-from drogue_models.painted_mesh import HIGHEST_REFLECTANCE, LOWEST_REFLECTANCE, PaintedMesh, Sheen
+from drogue_models.painted_mesh import HIGHEST_REFLECTANCE, LOWEST_REFLECTANCE, PaintedMesh
 from drogue_models.solids import loft, revolve
 from geometry.se3 import Array
 
@@ -42,14 +42,11 @@ class PaintedBody:
         return PaintedBody(mesh, self.uv, self.paint)
 
 
-# Semi-gloss aircraft paint mirrors about what varnish does; our choice.
-SEMI_GLOSS = Sheen(0.04, 0.35)
+def joined(bodies: Sequence[PaintedBody], emission_cd_m2: ArrayLike = (0.0, 0.0, 0.0)) -> PaintedMesh:
+    """All bodies as one surface, split at creases; their paints lie one below the other in its map.
 
-
-def joined(
-    bodies: Sequence[PaintedBody], sheen: Sheen | None = None, emission_cd_m2: ArrayLike = (0.0, 0.0, 0.0)
-) -> PaintedMesh:
-    """All bodies as one surface, split at creases; their paints lie one below the other in its map."""
+    The paint is matt: a sheen on bodies that fill much of the view takes as many paths as all else in the frame.
+    """
     height = sum(len(body.paint) for body in bodies)
     meshes, places, row = [], [], 0
     for body in bodies:
@@ -67,7 +64,6 @@ def joined(
         uv=np.concatenate(places),
         emission_cd_m2=np.asarray(emission_cd_m2, dtype=np.float64),
         smooth=True,
-        sheen=sheen,
     )
 
 

@@ -25,7 +25,6 @@ from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.surroundings.painted_bodies import (
     BARE_METAL,
     COLUMNS,
-    SEMI_GLOSS,
     PaintedBody,
     banded,
     chipped,
@@ -68,7 +67,7 @@ def probe_surface(shape: ObstacleShape, reflectance_rgb: ReflectanceRgb) -> Pain
     bodies += [_ring(rng, path, radii, place_m) for place_m in _ring_places_m(shape, rng)]
     if shape.form == "probe-retractable":
         bodies.append(_actuator(rng, path))
-    return joined(bodies, SEMI_GLOSS)
+    return joined(bodies)
 
 
 def _nozzle(rng: np.random.Generator, scale: float) -> PaintedBody:

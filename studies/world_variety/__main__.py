@@ -10,11 +10,13 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drogue_models.presets import PRESETS
+from drogue_models.presets import preset_names
 from drogue_models.tankers.tanker import STATIONS
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety
+
+_ROWS_PER_SHEET = 6
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -58,18 +60,19 @@ def _cells(found: Variety) -> str:
 
 
 def _draw_sheets(out: Path, workers: int | None) -> None:
-    drogues = {name: {"drogue": name} for name in PRESETS}
-    rows = sheet_rows(out / "drogues", drogues, workers, whole_image=False)
-    write_sheet(list(rows.values()), out / "drogues.png")
-    print(f"{out / 'drogues.png'}: {len(rows)} drogues", flush=True)
+    drogues = {name: {"drogue": name} for name in preset_names()}
     tankers = {
-        f"{name}-{station}": {"tanker": {"variants": [{"type": name, "station": station}]}}
-        for name, stations in STATIONS.items()
+        f"{kind}-{station}": {"tanker": {"variants": [{"type": kind, "station": station}]}}
+        for kind, stations in STATIONS.items()
         for station in stations
     }
-    rows = sheet_rows(out / "tankers", tankers, workers, whole_image=True)
-    write_sheet(list(rows.values()), out / "tankers.png")
-    print(f"{out / 'tankers.png'}: {len(rows)} tankers and stations")
+    for subject, changes in (("drogues", drogues), ("tankers", tankers)):
+        rows = sheet_rows(out / subject, changes, workers, whole_image=subject == "tankers")
+        # A sheet of more rows would be too large to look at.
+        for number, first in enumerate(range(0, len(rows), _ROWS_PER_SHEET), 1):
+            path = out / f"{subject}-{number}.jpg"
+            write_sheet(list(rows.values())[first : first + _ROWS_PER_SHEET], path)
+            print(f"{path}: {', '.join(list(rows)[first : first + _ROWS_PER_SHEET])}", flush=True)
 
 
 if __name__ == "__main__":

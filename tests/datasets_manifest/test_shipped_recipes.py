@@ -41,7 +41,7 @@ def test_paper_corpus_counts_as_the_paper_does() -> None:
     plan = plan_recipe(recipe, most_sampled=400)
     assert 2 * sum(plan.by_scene.values()) == 14_298
     assert len(plan.by_scene) == 89
-    assert set(plan.by_family) == {"sky", "cloud", "low-light", "ground"}
+    assert set(plan.by_family) == {"sky", "cloud", "low-light", "ground", "semi-physical"}
     shares = np.array([plan.by_split[name] for name in ("train", "val", "test")]) / 7149
     # Whole scenes: each end of a split is off by half a scene of 89 at most.
     np.testing.assert_allclose(shares, [0.7, 0.1, 0.2], atol=1.0 / 89)
