@@ -16,7 +16,8 @@ from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
-from labelgen.export.annotations.coco import DROGUE, HUB, MARKER, align_keypoint_orders, coco_image_id, write_coco
+from labelgen.export.annotations.coco import DROGUE, HUB, MARKER, coco_image_id, write_coco
+from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import symmetric_orders
 

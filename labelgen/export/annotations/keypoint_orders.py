@@ -1,0 +1,56 @@
+"""Keypoint results in the order of the truth, for drogues that look the same after a turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from pycocotools.coco import COCO
+
+from geometry.se3 import Array
+from labelgen.export.annotations.coco import DROGUE, NAMESPACE
+
+
+def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Keypoint results in the symmetric order that fits the truth best, to be scored by `COCOeval`.
+
+    An evenly spaced ring of eight looks the same after each of eight turns, so a detector may begin with any marker.
+    The order with the smallest sum of squared distances is taken; orders that are not a turn of the drogue, such as the
+    mirrored one, remain errors.
+
+    Args:
+        truth: a file of `write_coco` or a dataset's `annotations`.
+        results: as for `COCO.loadRes`, with `keypoints` in any of the symmetric orders, such as that in the image.
+
+    Returns:
+        Copies of the results; those on images without a drogue are unchanged.
+
+    Raises:
+        ValueError: a result with another number of keypoints than the truth has.
+    """
+    return [
+        _best_roll(result, [entry for entry in truth.imgToAnns[result["image_id"]] if entry["category_id"] == DROGUE])
+        for result in results
+    ]
+
+
+def _best_roll(result: dict[str, Any], drogues: list[dict[str, Any]]) -> dict[str, Any]:
+    points = np.array(result["keypoints"], dtype=np.float64).reshape(-1, 3)
+    best, least = points, np.inf
+    for drogue in drogues:
+        want = np.array(drogue["keypoints"], dtype=np.float64).reshape(-1, 3)
+        if want.shape != points.shape:
+            raise ValueError(f"keypoints: must be {len(want)} in every result, got {len(points)}")
+        for order in drogue[NAMESPACE]["equal_keypoint_orders"]:
+            rolled = points.copy()
+            rolled[list(order)] = points[: len(order)]
+            error = _squared_distance_px2(rolled, want)
+            if error < least:
+                best, least = rolled, error
+    return {**result, "keypoints": best.ravel().tolist()}
+
+
+def _squared_distance_px2(points: Array, want: Array) -> float:
+    shown = want[:, 2] > 0
+    return float(((points[shown, :2] - want[shown, :2]) ** 2).sum())
