@@ -44,7 +44,7 @@ def frame_with(
         obstacles.append(
             Obstacle(kind="distractor", shape=shape, left_from_object=pose, reflectance_rgb=(0.5, 0.5, 0.5))
         )
-    monkeypatch.setattr("render.surfaces.obstacle_surface", lambda shape, _: painted[shape])
+    monkeypatch.setattr("render.surfaces.bystander_surface", lambda shape, *_: painted[shape])
     nothing = {"drogue": None, "left_from_drogue": None, "left_from_tanker": None, "hose_nodes_left_m": None}
     return frame.model_copy(update={**nothing, "condition": None, "bystanders": tuple(obstacles)})
 
