@@ -76,7 +76,7 @@ bench-feed: ## how much of its time a training waits for pairs that are rendered
 
 bench-variety: ## how much drogues, tankers and probes differ between scenes, and sheets of them all (an hour; resumes)
 	@scripts/setup all
-	@$(BIN)/python -m studies.world_variety measure --out out/world-variety world-89
+	@$(BIN)/python -m studies.world_variety measure --out out/world-variety world-89 world-real
 	@$(BIN)/python -m studies.world_variety sheets --out out/world-variety
 
 CORPUS ?= out/detector/datasets/detector-small
