@@ -38,6 +38,7 @@ from drogue_models.procedural_maps import (
     streaks,
 )
 from drogue_models.surface_wear import SurfaceWear
+from geometry.bilinear_sampling import sample_bilinear
 from geometry.se3 import Array
 
 Paint = NDArray[np.float64]
@@ -225,7 +226,7 @@ def _around(layer: Layer, ring: MapGrid, height_m: Array, turn: Array) -> Layer:
     column = (turn * ring.columns - 0.5).astype(np.float32)
     row = (height_m / ring.texel_m[1] - 0.5).astype(np.float32)
     wrapped = np.hstack([layer[:, -1:], layer, layer[:, :1]]).astype(np.float32)
-    sampled: Layer = cv2.remap(wrapped, column + 1, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    sampled: Layer = sample_bilinear(wrapped, column + 1, row, cv2.BORDER_REPLICATE)
     return sampled.astype(np.float64)
 
 

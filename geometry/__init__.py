@@ -1,1 +1,1 @@
-"""Rigid transforms, pinhole cameras, the stereo rig and the images of circles, with numpy and scipy only."""
+"""Rigid transforms, pinhole cameras, the stereo rig, the images of circles, and samples between pixels."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
+from geometry.bilinear_sampling import sample_bilinear
 from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye, StereoRig
@@ -112,7 +113,7 @@ def air_in_front(frame: FrameSpec, pixel: NDArray[np.int64]) -> tuple[NDArray[np
     for first in range(0, len(pixel), _MOST_REMAP_ROWS):
         part = slice(first, first + _MOST_REMAP_ROWS)
         places = (u[part] * scale)[:, None], (v[part] * scale)[:, None]
-        light[part] = cv2.remap(coarse, *places, cv2.INTER_LINEAR)[:, 0]
+        light[part] = sample_bilinear(coarse, *places)[:, 0]
     x, y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
     per_depth = ambient.extinction_per_m * np.sqrt(1.0 + x * x + y * y)
     return light, per_depth.astype(np.float32)

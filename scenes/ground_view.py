@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
+from geometry.bilinear_sampling import sample_bilinear
 
 Field = NDArray[np.float32]
 _SMALLEST_LEVEL_PX = 8
@@ -109,7 +110,7 @@ class MipTile:
         """(H, W, C) values of one level at positions in texels of the finest level, within one repeat."""
         picture = self._levels[level]
         scale, half = np.float32(0.5**level), np.float32(0.5)
-        seen = cv2.remap(picture, u * scale - half, v * scale - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        seen = sample_bilinear(picture, u * scale - half, v * scale - half, cv2.BORDER_WRAP)
         seen = seen.reshape(*u.shape, -1)
         if picture.dtype == np.uint8:
             root: Field = seen.astype(np.float32)

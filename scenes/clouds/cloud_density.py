@@ -11,6 +11,7 @@ from scipy.special import ndtri
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import CloudLayer
+from geometry.bilinear_sampling import sample_bilinear
 
 _SIZE_PX = 1024
 # The largest blobs are 1/8 of one repeat, so that the repetition does not show.
@@ -208,7 +209,7 @@ def sample_tile(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.f
     u, v = x * texels, y * texels
     u -= np.floor(u / size) * size
     v -= np.floor(v / size) * size
-    result: NDArray[np.float32] = cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    result: NDArray[np.float32] = sample_bilinear(tile, u, v, cv2.BORDER_WRAP)
     return result
 
 
@@ -234,6 +235,6 @@ def sample_texture(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[n
         u, v = x * texels, y * texels
         u -= np.floor(u / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
         v -= np.floor(v / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
-        total += np.float32(weight) * cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        total += np.float32(weight) * sample_bilinear(tile, u, v, cv2.BORDER_WRAP)
         norm += weight**2
     return total / np.float32(np.sqrt(norm))

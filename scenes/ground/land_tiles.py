@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
+from geometry.bilinear_sampling import sample_bilinear
 from scenes.ground_view import Field, MipTile, power_noise, smooth_noise
 
 LandKind = Literal["fields", "forest", "dry", "town"]
@@ -80,7 +81,7 @@ def _bent(canvas: Field, stream: str, amplitude_px: float, cycles: float) -> Fie
     u += np.float32(amplitude_px) * _smooth(f"{stream} u", cycles)
     v += np.float32(amplitude_px) * _smooth(f"{stream} v", cycles)
     size = np.float32(_SIZE_PX)
-    bent: Field = cv2.remap(canvas, np.mod(u, size), np.mod(v, size), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    bent: Field = sample_bilinear(canvas, np.mod(u, size), np.mod(v, size), cv2.BORDER_WRAP)
     return bent
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
 from drogue_models.frozen_model import ReflectanceRgb
+from geometry.bilinear_sampling import sample_bilinear
 from scenes.ground_view import Field, GroundView, MipTile, power_noise
 from scenes.sky.photometry import Radiance
 
@@ -161,7 +162,7 @@ class Sea:
         azimuth = np.arctan2(view.away_y, view.away_x)
         column = np.mod(azimuth * np.float32(_TABLE_COLUMNS / (2 * np.pi)), np.float32(_TABLE_COLUMNS))
         # One column is repeated at the end, because remap would wrap rows as well as columns.
-        seen = cv2.remap(self._table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = sample_bilinear(self._table, column, row, cv2.BORDER_REPLICATE)
         return np.asarray(seen, dtype=np.float32).reshape(*view.x_m.shape, 3)
 
     def _glint(self, view: GroundView, slope_x: Field, slope_y: Field, gusts: Field) -> Radiance:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.storage.image_codecs import check_pixel_count, decode_exr
 from datasets_manifest.types.environment import EnvironmentMap, read_environment_map
+from geometry.bilinear_sampling import sample_bilinear
 from scenes.sky.photometry import Radiance, luminance
 
 _SMALLEST_PX = 16
@@ -52,7 +53,7 @@ class EnvironmentMapLight:
         # One more column on either side, because remap would wrap rows as well as columns.
         wide = np.concatenate([self.image[:, -1:], self.image, self.image[:, :1]], axis=1)
         places = (column + 1.0).astype(np.float32), row.astype(np.float32)
-        return np.asarray(cv2.remap(wide, *places, cv2.INTER_LINEAR), dtype=np.float32).reshape(directions.shape)
+        return np.asarray(sample_bilinear(wide, *places), dtype=np.float32).reshape(directions.shape)
 
     def downsampled(self, height_px: int) -> EnvironmentMapLight:
         """The same light with a smaller image, averaged over its texels; itself if the image is not larger."""

@@ -114,16 +114,20 @@ def test_a_worn_drogue_is_written_with_its_maps(worn: dict[int, PaintedMesh]) ->
     loaded = scene.geometry["canopy"]
     picture = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB"))
     assert picture.shape[:2] == worn[Part.CANOPY].reflectance.shape[:2]
-    # The reader counts v upwards from the picture's last row.
-    uv = np.asarray(loaded.visual.uv)
+    # In the middle of every face, because corners lie on the edges of texels, which 32 bits round either way.
+    uv = np.asarray(loaded.visual.uv)[loaded.faces].mean(axis=1)
     height, width = picture.shape[:2]
-    row = np.clip(((1.0 - uv[:, 1]) * height).astype(int), 0, height - 1)
-    seen = picture[row, np.clip((uv[:, 0] * width).astype(int), 0, width - 1)] / 255.0
+    # The reader counts v upwards from the picture's last row.
+    places = np.stack([uv[:, 0] * width, (1.0 - uv[:, 1]) * height], axis=1)
+    column, row = places.astype(int).T
+    seen = picture[row, column] / 255.0
     linear = np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
     canopy = worn[Part.CANOPY]
-    expected = texels_at(canopy, canopy.uv[canopy.mesh.faces.ravel()])
-    # Half a level of eight bits; a texture coordinate of 32 bits may round to the neighbouring texel.
-    assert np.mean(np.abs(linear - expected) < 0.004) > 0.95
+    expected = texels_at(canopy, canopy.uv[canopy.mesh.faces].mean(axis=1))
+    inside = np.all(np.abs(places - np.rint(places)) > 1e-3, axis=1)
+    assert np.mean(inside) > 0.5
+    # Half a level of eight bits.
+    np.testing.assert_allclose(linear[inside], expected[inside], rtol=0, atol=0.004)
 
 
 @pytest.mark.parametrize(
