@@ -30,6 +30,7 @@ from nav.centroids.blurred_edges import blurred_step
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
+from nav.pair_faults import unreadable_reason
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
 from nav.pose.marker_geometry import project_markers
@@ -120,6 +121,12 @@ class LatestItemQueue(Generic[Item]):
             (_, item), late = self._waiting, tuple(self._late)
             self._waiting, self._late, self._late_after = None, self._late_after, []
             return late, item
+
+    def take_late(self) -> tuple[int, ...]:
+        """The numbers of late items that no item followed, once the queue is closed and empty."""
+        with self._changed:
+            late, self._late, self._late_after = (*self._late, *self._late_after), [], []
+            return late
 
     def close(self) -> None:
         """Accept no more items."""
@@ -244,7 +251,7 @@ def process_arrivals(
         Answers in the order of the pairs.
 
     Raises:
-        ValueError: a pair that cannot be read.
+        ValueError: the source cannot read a pair, and does not skip it.
     """
     warm_up_jit()
     return _Stages(source, navigator, clock).answers()
@@ -267,7 +274,7 @@ class PairStream(Protocol):
 def replay(
     source: PairStream, navigator: SequenceNavigator, rate_hz: float, clock: Clock
 ) -> Generator[PairEstimates | SkippedPair]:
-    """Replay stereo pairs at a rate, and yield the answers to all of them.
+    """Replay stereo pairs at a rate, and yield the answers to all of them; a pair that cannot be read is skipped.
 
     Args:
         source: the pairs, in the order of their indices.
@@ -279,7 +286,7 @@ def replay(
         Answers in the order of the pairs.
 
     Raises:
-        ValueError: a rate that is not positive, or a pair that cannot be read.
+        ValueError: a rate that is not positive.
     """
     if not 0 < rate_hz < float("inf"):
         raise ValueError(f"rate_hz: must be positive and finite, got {rate_hz:g}")
@@ -301,16 +308,23 @@ class _Replay:
         self._stop.set()
 
     def arrivals(self) -> Iterator[ArrivedPair | SkippedPair]:
-        """See `PairSource`. After a slow read, it skips to the newest pair that is in time."""
+        """See `PairSource`. After a slow read, it skips to the newest pair that is in time.
+
+        A pair that cannot be read is skipped with its fault.
+        """
         indices, start_s, index = self._source.frame_indices, None, 0
         while index < len(indices) and not self._stop.is_set():
             read_start_s = self._clock.now_s()
-            pair = self._source.pair(indices[index])
+            pair, fault = None, None
+            try:
+                pair = self._source.pair(indices[index])
+            except ValueError as error:
+                fault = unreadable_reason(indices[index], error)
             read_s = self._clock.now_s() - read_start_s
             start_s = self._clock.now_s() if start_s is None else start_s
             arrived_s = start_s + index / self._rate_hz
             self._clock.wait_until(arrived_s, self._stop)
-            yield ArrivedPair(pair, arrived_s, read_s)
+            yield SkippedPair(indices[index], fault) if pair is None else ArrivedPair(pair, arrived_s, read_s)
             next_index = max(index + 1, min(self._next_index(start_s, read_s), len(indices) - 1))
             for late in indices[index + 1 : next_index]:
                 yield SkippedPair(late)
@@ -332,6 +346,7 @@ class _Stages:
         self._arrived_pairs: LatestItemQueue[ArrivedPair] = LatestItemQueue()
         self._measured_pairs: SingleItemQueue[_MeasuredPair] = SingleItemQueue()
         self._answers: Queue[PairEstimates | SkippedPair | BaseException | None] = Queue(_WAITING_ANSWERS)
+        self._unreadable: dict[int, str] = {}
 
     def answers(self) -> Generator[PairEstimates | SkippedPair]:
         """See `process_arrivals`."""
@@ -374,6 +389,8 @@ class _Stages:
     def _arrival_stage(self) -> None:
         for each in self._source.arrivals():
             if isinstance(each, SkippedPair):
+                if each.fault is not None:
+                    self._unreadable[each.frame_index] = each.fault
                 self._arrived_pairs.skip(each.frame_index)
             else:
                 self._arrived_pairs.put(each.pair.frame_index, each)
@@ -388,12 +405,12 @@ class _Stages:
     def _estimate_stage(self) -> None:
         while not self._stop.is_set() and (measured := self._measured_pairs.take()) is not None:
             self._emit_with_late(measured)
-        self._emit(None)
+        self._emit_end()
 
     def _combined_stage(self) -> None:
         while not self._stop.is_set() and (newest_pair := self._arrived_pairs.take()) is not None:
             self._emit_with_late(self._measure(*newest_pair))
-        self._emit(None)
+        self._emit_end()
 
     def _measure(self, late: tuple[int, ...], arrival: ArrivedPair) -> _MeasuredPair:
         started_s = self._clock.now_s()
@@ -401,9 +418,16 @@ class _Stages:
         return _MeasuredPair(late, arrival, pair, started_s, finished_s=self._clock.now_s())
 
     def _emit_with_late(self, measured: _MeasuredPair) -> None:
-        for frame_index in measured.late:
-            self._emit(SkippedPair(frame_index))
+        self._emit_skipped(measured.late)
         self._emit(self._estimate(measured))
+
+    def _emit_skipped(self, frame_indices: tuple[int, ...]) -> None:
+        for frame_index in frame_indices:
+            self._emit(SkippedPair(frame_index, self._unreadable.get(frame_index)))
+
+    def _emit_end(self) -> None:
+        self._emit_skipped(self._arrived_pairs.take_late())
+        self._emit(None)
 
     def _estimate(self, measured: _MeasuredPair) -> PairEstimates:
         arrival, taken_s = measured.arrival, self._clock.now_s()

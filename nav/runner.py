@@ -10,6 +10,7 @@ from drogue_models.marker_layout import marker_layout
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 from nav.docking import docking_quantities
 from nav.filtering.smoother import SMOOTHER_SUFFIX, smooth
+from nav.pair_faults import unreadable_reason
 from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.method_registry import method_names, pose_method
 from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair
@@ -80,10 +81,10 @@ def navigate(
         detector: a name from `nav.detector.detector_registry.detector_names`, or a network's file.
 
     Yields:
-        One estimate per frame and method, in that order.
+        One estimate per frame and method, in that order; no fix, with the reason, for a pair that cannot be read.
 
     Raises:
-        ValueError: a method or detector that does not exist, before any image is read, or an image that cannot be read.
+        ValueError: a method or detector that does not exist, before any image is read.
     """
     settings = SequenceSettings(tuple(methods), centroids)
     return add_smoothed(process_dataset(dataset, open_navigator(settings, detector)), settings)
@@ -104,9 +105,15 @@ def open_navigator(settings: SequenceSettings, detector: str | None = None) -> S
     return SequenceNavigator(settings, detector_factory(DEFAULT_DETECTOR if detector is None else detector))
 
 
-def process_dataset(dataset: BlindDataset, navigator: SequenceNavigator) -> Generator[PairEstimates]:
-    """Estimates of all pairs of a dataset, computed lazily."""
-    return (navigator.process(dataset.pair(index)) for index in dataset.frame_indices)
+def process_dataset(dataset: BlindDataset, navigator: SequenceNavigator) -> Generator[PairEstimates | SkippedPair]:
+    """Estimates of all pairs of a dataset, computed lazily; a pair that cannot be read is skipped with its fault."""
+    for index in dataset.frame_indices:
+        try:
+            pair = dataset.pair(index)
+        except ValueError as error:
+            yield SkippedPair(index, unreadable_reason(index, error))
+        else:
+            yield navigator.process(pair)
 
 
 def add_smoothed(pairs: Iterable[PairEstimates | SkippedPair], settings: SequenceSettings) -> Iterator[Estimate]:
@@ -114,7 +121,8 @@ def add_smoothed(pairs: Iterable[PairEstimates | SkippedPair], settings: Sequenc
     smoother = SequenceSmoother(settings) if settings.smoothed else None
     for each in pairs:
         if isinstance(each, SkippedPair):
-            yield from (NoFix(frame_index=each.frame_index, method=name, reason=LATE) for name in settings.names)
+            reason = each.fault or LATE
+            yield from (NoFix(frame_index=each.frame_index, method=name, reason=reason) for name in settings.names)
             continue
         if smoother is not None:
             yield from smoother.add(each)

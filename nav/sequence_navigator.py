@@ -2,7 +2,8 @@
 
 The navigator gets the images, time stamps, rig and drogue of each pair and nothing else. A jump of the time stamps
 begins a new sequence. A pair in which the drogue is not seen gets no pose, even where a filter or a smoother could
-predict one from other pairs.
+predict one from other pairs. An exception within a pair ends the work on that pair alone: it gets no pose, with the
+exception as the reason.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
+from nav.pair_faults import fault_reason
 from nav.pair_measurement import PairMeasurement
 from nav.pair_navigator import CentroidChoice, PairNavigator
+from nav.pose.pose_method import NoFixReason
 from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 
@@ -72,12 +75,14 @@ class MeasuredPair:
         navigator: for its rig and drogue.
         measurement: the markers found.
         begins: whether it is the first of a sequence.
+        fault: the exception that ended the measurement, or None.
     """
 
     pair: BlindPair
     navigator: PairNavigator
     measurement: PairMeasurement
     begins: bool
+    fault: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +97,7 @@ class PairEstimates:
         estimates: of every method in their order, and then the filtered ones.
         stage_s: seconds by stage, of all methods together. [s]
         latency_s: from the arrival of the pair to these estimates, where pairs arrive at a rate. [s]
+        fault: the exception that ended the work on the pair, or None.
     """
 
     frame_index: int
@@ -102,13 +108,20 @@ class PairEstimates:
     estimates: tuple[Estimate, ...]
     stage_s: dict[str, float]
     latency_s: float | None = None
+    fault: str | None = None
 
 
 @dataclass(frozen=True)
 class SkippedPair:
-    """A pair that was dropped because a newer one arrived before its turn came."""
+    """A pair that was not worked on.
+
+    Attributes:
+        frame_index: of the pair.
+        fault: why it cannot be read; None where a newer pair arrived before its turn came.
+    """
 
     frame_index: int
+    fault: str | None = None
 
 
 class SequenceNavigator:
@@ -155,18 +168,28 @@ class SequenceNavigator:
         elif begins and self._observer is not None:
             self._observer.reset()
         observe = self._navigator.observe if self._observer is None else self._observer.observe
-        return MeasuredPair(pair, self._navigator, observe(pair.images), begins)
+        try:
+            return MeasuredPair(pair, self._navigator, observe(pair.images), begins)
+        except Exception as error:
+            fault = fault_reason(pair.frame_index, error)
+        # The tracker may have learnt half of the pair, so the next one begins anew.
+        self._last_s = None
+        if self._observer is not None:
+            self._observer.reset()
+        return MeasuredPair(pair, self._navigator, PairMeasurement(NoFixReason(fault), {}), begins, fault)
 
     def estimate(self, measured: MeasuredPair) -> PairEstimates:
         """Estimate the pose by every method, and its motion."""
-        pair, settings = measured.pair, self._settings
-        estimates = measured.navigator.estimate_measured(
-            pair.frame_index, pair.images, measured.measurement, settings.methods
-        )
-        if measured.begins and settings.filtered:
-            order = marker_layout(pair.drogue).symmetry_order
-            self._filters = {method: PoseFilter(settings.motion, order) for method in settings.methods}
-        filtered = [self._filtered(pair, estimate) for estimate in estimates] if settings.filtered else []
+        pair, settings, fault = measured.pair, self._settings, measured.fault
+        try:
+            estimates, filtered = self._estimate_all(measured)
+        except Exception as error:
+            fault = fault_reason(pair.frame_index, error)
+            # A filter may have taken half of the pair, so the next one begins anew.
+            self._filters = {}
+            estimates = _without_fix(pair, settings.methods, fault)
+            names = [name + FILTER_SUFFIX for name in settings.methods] if settings.filtered else []
+            filtered = _without_fix(pair, names, fault)
         return PairEstimates(
             frame_index=pair.frame_index,
             time_s=pair.images.time_s,
@@ -175,7 +198,21 @@ class SequenceNavigator:
             begins=measured.begins,
             estimates=(*estimates, *filtered),
             stage_s=_total_stage_times(estimates, filtered),
+            fault=fault,
         )
+
+    def _estimate_all(self, measured: MeasuredPair) -> tuple[list[Estimate], list[Estimate]]:
+        """Estimates of a pair by every method, and the filtered ones where they are asked for."""
+        pair, settings = measured.pair, self._settings
+        estimates = measured.navigator.estimate_measured(
+            pair.frame_index, pair.images, measured.measurement, settings.methods
+        )
+        if not settings.filtered:
+            return estimates, []
+        if measured.begins or not self._filters:
+            order = marker_layout(pair.drogue).symmetry_order
+            self._filters = {method: PoseFilter(settings.motion, order) for method in settings.methods}
+        return estimates, [self._filtered(pair, estimate) for estimate in estimates]
 
     def _observer_of(self, navigator: PairNavigator, pair: BlindPair) -> TrackedObserver | None:
         if self._tracker is None:
@@ -205,6 +242,10 @@ class SequenceNavigator:
         estimate = update.state.to_estimate(pair.frame_index, method, measured)
         stage_s = {**measured.stage_s, "filter": perf_counter() - start}
         return estimate.model_copy(update={"docking": docking, "stage_s": stage_s})
+
+
+def _without_fix(pair: BlindPair, names: Sequence[str], reason: str) -> list[Estimate]:
+    return [NoFix(frame_index=pair.frame_index, method=name, reason=reason) for name in names]
 
 
 def _total_stage_times(measured: Sequence[Estimate], filtered: Sequence[Estimate]) -> dict[str, float]:

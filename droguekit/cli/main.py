@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import keyword
+import logging
 import os
 import sys
 from pathlib import Path
@@ -141,6 +142,14 @@ def explain(error: BaseException) -> str:
     return f"internal fault, {type(error).__name__}: {text}; please report it with what --debug shows"
 
 
+def _show_pair_faults() -> None:
+    """Show the traces of faults that end the work on one pair and not the run."""
+    logger = logging.getLogger("nav.pair_faults")
+    if not logger.handlers:
+        logger.addHandler(logging.StreamHandler())
+    logger.setLevel(logging.DEBUG)
+
+
 def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit") -> int:
     """Run a command line.
 
@@ -154,6 +163,8 @@ def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit
     """
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
+    if debug:
+        _show_pair_faults()
     try:
         typer.main.get_command(command).main(args=arguments, prog_name=name, standalone_mode=True)
     except SystemExit as exit_:

@@ -37,14 +37,27 @@ class DetectionOptions:
     threshold: float | None = None
 
 
-def benchmark_lines(
+@dataclass(frozen=True)
+class BenchmarkOutcome:
+    """What a benchmark tells.
+
+    Attributes:
+        lines: of the result.
+        fault: pairs in which a detector failed, as one line; None for nothing.
+    """
+
+    lines: Iterator[str]
+    fault: str | None = None
+
+
+def run_benchmarks(
     dataset: Location,
     estimates: Path | None,
     options: DetectionOptions,
     outputs: tuple[Path | None, Path | None],
     report: ProgressReport,
-) -> Iterator[str]:
-    """Compare estimates, or a detector's boxes, with the truth, and give the result as lines.
+) -> BenchmarkOutcome:
+    """Compare estimates, or a detector's boxes, with the truth.
 
     Args:
         dataset: with its truth, or an imported one without.
@@ -64,12 +77,13 @@ def benchmark_lines(
     if estimates is None:
         from droguekit.scoring.detection.detection_tables import detector_lines
 
-        return detector_lines(benchmark_detections(dataset, options, json_out, html_out, report))
+        result, fault = benchmark_detections(dataset, options, json_out, html_out, report)
+        return BenchmarkOutcome(detector_lines(result), fault)
     if options.split is not None or options.threshold is not None:
         raise ValueError("--split, --threshold: are for detections, not for estimates")
     if open_storage(dataset).exists(BLIND_FILE):
-        return _blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out))
-    return _error_lines(benchmark_dataset(dataset, estimates, json_out, html_out))
+        return BenchmarkOutcome(_blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out)))
+    return BenchmarkOutcome(_error_lines(benchmark_dataset(dataset, estimates, json_out, html_out)))
 
 
 def _error_lines(result: BenchmarkResult) -> Iterator[str]:
@@ -135,8 +149,11 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
 
 def benchmark_detections(
     dataset: Location, options: DetectionOptions, json_out: Path | None, html_out: Path | None, report: ProgressReport
-) -> DetectionResult:
+) -> tuple[DetectionResult, str | None]:
     """Compare boxes with the truth, and write numbers and report where files are given.
+
+    Returns:
+        The result, and pairs in which a detector failed as one line; None for nothing. They count as without boxes.
 
     Raises:
         ValueError: a dataset, file or detector that cannot be read, or two of one name.
@@ -152,16 +169,19 @@ def benchmark_detections(
     truth = read_detection_truth(dataset)
     # Errors are found before a detector runs.
     split = split_to_score(truth.images, options.split)
-    scored = score_detections(truth, _runs(dataset, options, report), split, options.threshold)
+    runs, fault = _runs(dataset, options, report)
+    scored = score_detections(truth, runs, split, options.threshold)
     if json_out is not None:
         write_text_atomic(json_out, scored.result.to_json())
     if html_out is not None:
         write_detection_report(dataset, scored, html_out)
-    return scored.result
+    return scored.result, fault
 
 
-def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
-    """Boxes by their name in the report; all files are opened before the first detector runs."""
+def _runs(
+    dataset: Location, options: DetectionOptions, report: ProgressReport
+) -> tuple[dict[str, DetectorOutput], str | None]:
+    """Boxes by their name in the report, and a detector's faults; all files are opened before a detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
     from droguekit.scoring.detection.detection_scores import DetectorOutput
     from droguekit.scoring.detection.detector_runner import DetectorRunner
@@ -178,7 +198,8 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
         if names.count(name) > 1:
             raise ValueError(f"--detections, --detector: two are named {name!r}; rename a file")
     runs += [(detecting.name, _detector_run(name, detecting, report)) for name, detecting in passes]
-    return dict(runs)
+    faults = (f"{detecting.name}: {line}" for _, detecting in passes if (line := detecting.faults.line()) is not None)
+    return dict(runs), next(faults, None)
 
 
 def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:

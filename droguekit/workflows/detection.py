@@ -120,13 +120,23 @@ def training_lines(result: TrainingResult) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class DetectionSummary:
-    """What `detect_dataset` found, and how long it took."""
+    """What `detect_dataset` found, and how long it took.
+
+    Attributes:
+        detector: its name.
+        boxes: how many.
+        images_with_boxes: how many.
+        pairs: how many there are.
+        times: of the pairs.
+        fault: pairs without a result, as one line; None for nothing.
+    """
 
     detector: str
     boxes: int
     images_with_boxes: int
     pairs: int
     times: PairTimes
+    fault: str | None = None
 
 
 def detect_dataset(
@@ -143,7 +153,7 @@ def detect_dataset(
     regular intervals to check the tracker.
 
     Raises:
-        ValueError: no such dataset, detector or tracker, a score outside 0 to 1, or an image that cannot be read.
+        ValueError: no such dataset, detector or tracker, a score outside 0 to 1, or no pair without a fault.
         OSError: the file cannot be written; it stays as it was.
     """
     from droguekit.scoring.detection.detector_runner import DetectorRunner
@@ -167,7 +177,9 @@ def detect_dataset(
 
     report.begin("pairs", detecting.pairs)
     try:
-        boxes = write_detections(out, counted())
+        found = list(counted())
     finally:
         report.end()
-    return DetectionSummary(detecting.name, boxes, len(images), detecting.pairs, detecting.times())
+    times = detecting.times()
+    boxes = write_detections(out, found)
+    return DetectionSummary(detecting.name, boxes, len(images), detecting.pairs, times, detecting.faults.line())

@@ -7,13 +7,14 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import monotonic
 from types import FrameType
-from typing import TYPE_CHECKING, Literal, Self, cast
+from typing import TYPE_CHECKING, Literal, cast
 
+from droguekit.workflows.estimate_file import EstimateFile
 from droguekit.workflows.importing import _UNITS_M, ImportOptions
 from droguekit.workflows.navigation import (
     FixCount,
@@ -25,10 +26,10 @@ from droguekit.workflows.navigation import (
     sequence_settings,
     tallied,
 )
+from nav.pair_faults import PairFaults
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
-    from datasets_manifest.types.estimates import Estimate
     from droguekit.batch.progress import ProgressReport
     from droguekit.capture.live_pairs import CameraSettings, CaptureSettings, LivePairs
     from droguekit.capture.stereo_source import StereoSource
@@ -153,12 +154,12 @@ def navigate_live(
     source, camera, remarks = _camera(live, options.rate_hz, clock)
     pairs = LivePairs(source, camera)
     navigator = open_navigator(settings, options.detector)
-    tally, fixes, fault = LatencyTally(_NEWEST), Counter[str](), None
+    tally, fixes, fault, faults = LatencyTally(_NEWEST), Counter[str](), None, PairFaults()
     status = _Status(pairs, remarks, tally, fixes, report)
-    with _EstimateFile(out) as file, one_thread(), _ended_by_signals(pairs.stop):
+    with EstimateFile(out) as file, one_thread(), _ended_by_signals(pairs.stop):
         with closing(process_arrivals(pairs, navigator, clock)) as answers:
             try:
-                for estimate in add_smoothed(tallied(answers, tally, status.advance), settings):
+                for estimate in add_smoothed(tallied(answers, tally, faults, status.advance), settings):
                     file.write(estimate)
                     fixes[estimate.method] += estimate.status == "fix"
             except OSError as error:
@@ -173,7 +174,7 @@ def navigate_live(
             except OSError as error:
                 fault = fault or error.strerror
     counts = [FixCount(name, fixes[name], tally.pairs) for name in settings.names]
-    return NavigationSummary(counts, latency, fault or pairs.fault)
+    return NavigationSummary(counts, latency, fault or pairs.fault or faults.line(), faults)
 
 
 def _camera(
@@ -225,49 +226,6 @@ class _Status:
             fixes = ", ".join(f"{method} {count} fixes" for method, count in self._fixes.most_common(1))
             self._report.say(f"{self._tally.pairs} pairs, {self._tally.late} late, {fixes or 'no fix yet'}")
         self._told_s = now_s
-
-
-class _EstimateFile:
-    """A file of estimates that has every line as soon as it is written, and no half one."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._lines, self._size = path, 0, 0
-
-    def __enter__(self) -> Self:
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            # Without a buffer, nothing is lost when the process dies; a pipe or a terminal is there already.
-            self._file = self._path.open("wb" if self._path.exists() else "xb", buffering=0)
-        except OSError as error:
-            raise OSError(error.errno, f"{self._path}: cannot be written: {error.strerror}") from error
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
-
-    def write(self, estimate: Estimate) -> None:
-        """Append a line.
-
-        Raises:
-            OSError: it cannot be written; the lines before it are whole.
-        """
-        line = memoryview(estimate.model_dump_json().encode() + b"\n")
-        written = 0
-        try:
-            while written < len(line):
-                written += self._file.write(line[written:])
-        except OSError as error:
-            with suppress(OSError):
-                self._file.truncate(self._size)
-            text = f"{self._path}: cannot be written: {error.strerror}; the {self._lines} estimates before are kept"
-            raise OSError(error.errno, text) from error
-        self._lines += 1
-        self._size += written
-
-    def remove(self) -> None:
-        """Delete the file, in which there is nothing."""
-        if self._path.is_file():
-            self._path.unlink()
 
 
 @contextmanager

@@ -6,17 +6,19 @@ import json
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from droguekit.workflows.estimate_file import EstimateFile
+from nav.pair_faults import PairFaults
+
 if TYPE_CHECKING:
     from datasets_manifest.storage.blind import BlindDataset
     from datasets_manifest.storage.storage import Location
-    from datasets_manifest.types.estimates import Estimate
     from droguekit.batch.progress import ProgressReport
     from nav.sequence_navigator import PairEstimates, SequenceSettings, SkippedPair
 
@@ -191,17 +193,21 @@ class NavigationSummary:
     Attributes:
         fixes: of every method.
         latency: None where pairs did not arrive in real time.
-        fault: what ended a camera's run too early, as one line; None for nothing.
+        fault: what ended a camera's run too early, or pairs without an estimate, as one line; None for nothing.
+        faults: the pairs whose work ended by a fault.
     """
 
     fixes: list[FixCount]
     latency: LatencyReport | None
     fault: str | None = None
+    faults: PairFaults = field(default_factory=PairFaults)
 
     def lines(self) -> list[str]:
         """The summary for the user."""
         width = max(16, *(len(fixes.method) for fixes in self.fixes))
         lines = [f"{fixes.method:<{width}} {fixes.fixes} fixes in {fixes.pairs} pairs" for fixes in self.fixes]
+        if self.faults.count:
+            lines.append(f"{'faults':<{width}} in {self.faults.count} of {self.fixes[0].pairs} pairs")
         return lines + ([] if self.latency is None else self.latency.lines())
 
 
@@ -212,16 +218,16 @@ def navigate_dataset(
     report: ProgressReport,
     options: NavigationOptions | None = None,
 ) -> NavigationSummary:
-    """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
+    """Estimate poses in every pair without the truth, and write each when it exists; all methods when none is named.
+
+    A pair that cannot be read, or in which our own code fails, gets no fix with that reason, and the summary counts it.
 
     Raises:
-        ValueError: no such dataset, method, detector, tracker or way to measure centres, an output that is a folder,
-            or an image that cannot be read.
-        OSError: the estimates cannot be written.
+        ValueError: no such dataset, method, detector, tracker or way to measure centres, or an output that is a folder.
+        OSError: the estimates cannot be written; those before are kept.
     """
     from datasets_manifest.atomic import write_text_atomic
     from datasets_manifest.storage.blind import BlindDataset
-    from datasets_manifest.types.estimates import write_estimates
     from droguekit.numerical_threads import one_thread
     from nav.runner import add_smoothed
 
@@ -230,29 +236,25 @@ def navigate_dataset(
     check_places(out, options.latency_out)
     blind = BlindDataset(dataset)
     tally = None if options.rate_hz is None else LatencyTally()
-    fixes: Counter[str] = Counter()
-
-    def counted(answers: Iterable[PairEstimates | SkippedPair]) -> Iterator[Estimate]:
-        for estimate in add_smoothed(tallied(answers, tally, report.advance), settings):
-            fixes[estimate.method] += estimate.status == "fix"
-            yield estimate
-
+    fixes, faults = Counter[str](), PairFaults()
     opened = _estimate_pairs(blind, settings, options)
     # Closing ends the threads of real-time processing, whatever stops the writing.
     with one_thread(), closing(opened) as answers:
-        for file in filter(None, (out, options.latency_out)):
-            file.parent.mkdir(parents=True, exist_ok=True)
+        if options.latency_out is not None:
+            options.latency_out.parent.mkdir(parents=True, exist_ok=True)
         report.begin("pairs", len(blind.frame_indices))
         try:
-            write_estimates(out, counted(answers))
+            with EstimateFile(out) as file:
+                for estimate in add_smoothed(tallied(answers, tally, faults, report.advance), settings):
+                    file.write(estimate)
+                    fixes[estimate.method] += estimate.status == "fix"
         finally:
             report.end()
     latency = None if tally is None or options.rate_hz is None else tally.report(options.rate_hz)
     if latency is not None and options.latency_out is not None:
         write_text_atomic(options.latency_out, latency.to_json())
-    return NavigationSummary(
-        [FixCount(name, fixes[name], len(blind.frame_indices)) for name in settings.names], latency
-    )
+    counts = [FixCount(name, fixes[name], len(blind.frame_indices)) for name in settings.names]
+    return NavigationSummary(counts, latency, faults.line(), faults)
 
 
 def check_places(out: Path, latency_out: Path | None) -> None:
@@ -306,22 +308,28 @@ def _estimate_pairs(
 
 
 def tallied(
-    answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, advance: Callable[[], None]
+    answers: Iterable[PairEstimates | SkippedPair],
+    tally: LatencyTally | None,
+    faults: PairFaults,
+    advance: Callable[[], None],
 ) -> Iterator[PairEstimates | SkippedPair]:
-    """Pass on the estimates, and collect latencies; time until the next request counts as output.
+    """Pass on the estimates, and collect latencies and faults; time until the next request counts as output.
 
     Args:
         answers: of the pairs.
-        tally: that collects, or None.
+        tally: that collects latencies, or None.
+        faults: that collects faults.
         advance: called after each pair.
     """
     from nav.sequence_navigator import SkippedPair
 
     for each in answers:
+        if each.fault is not None:
+            faults.note(each.frame_index, each.fault)
         start = perf_counter()
         yield each
         if isinstance(each, SkippedPair):
-            if tally is not None:
+            if tally is not None and each.fault is None:
                 tally.skipped()
         elif tally is not None and each.latency_s is not None:
             tally.processed(each.latency_s, {**each.stage_s, "output": perf_counter() - start})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import resource
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from datasets_manifest.storage import layout
+from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import FAULT, WRONG_INPUT, run
 from tests.support.recipe_builder import between, recipe_text
 
@@ -145,9 +147,16 @@ def test_a_truncated_image(damaged: Path, tmp_path: Path) -> None:
     result = _run("validate", damaged)
     assert result.returncode == FAULT
     assert re.search(r"000001/right\.png", result.stdout)
-    estimates = tmp_path / "estimates.jsonl"
-    _assert_refused(_run("navigate", damaged, "--out", estimates), r"000001/right\.png: the PNG is truncated")
-    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+    # One pair does not end the work on the others.
+    estimates, detections = tmp_path / "estimates.jsonl", tmp_path / "detections.json"
+    for command in (["navigate", "--method", "constant", "--out", estimates], ["detect", "--out", detections]):
+        result = _run(command[0], damaged, *command[1:])
+        assert result.returncode == FAULT
+        assert re.search(r"first pair 1: .*000001/right\.png: the PNG is truncated", result.stderr)
+        assert "Traceback" not in result.stderr
+    pairs = len(list((damaged / "frames").iterdir()))
+    assert len(list(read_estimates(estimates))) == pairs
+    assert {entry["image_id"] for entry in json.loads(detections.read_text())}.isdisjoint({3, 4})
 
 
 def test_a_truncated_record(damaged: Path, tmp_path: Path) -> None:

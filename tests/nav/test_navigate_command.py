@@ -9,7 +9,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -20,9 +20,10 @@ from datasets_manifest.importers.imported_dataset import ImportedPair, ImportSet
 from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
-from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
 from geometry.se3 import RigidTransform, rotation_from_angles
+from nav.pair_navigator import PairNavigator
 from tests.support.painted_pairs import fly_past
 
 PAIRS = 6
@@ -154,8 +155,9 @@ def test_places_that_cannot_take_results_are_refused_before_the_work(
     assert list(folder.iterdir()) == []
 
 
-def test_a_damaged_pair_in_real_time_leaves_no_estimates(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("rate", [[], ["--rate", "1000"]])
+def test_a_damaged_pair_gets_no_fix_and_all_others_theirs(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rate: list[str]
 ) -> None:
     data = tmp_path / "data"
     for file in flight.rglob("*"):
@@ -164,9 +166,79 @@ def test_a_damaged_pair_in_real_time_leaves_no_estimates(
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(file.read_bytes()[: 5000 if file.match("*/000005/right.png") else None])
     out = tmp_path / "estimates.jsonl"
-    assert run(["navigate", str(data), "--method", "constant", "--rate", "1000", "--out", str(out)]) == WRONG_INPUT
-    assert re.search(r"000005/right\.png: the PNG is truncated", capsys.readouterr().err)
-    assert not out.exists()
+    assert run(["navigate", str(data), "--method", "constant", *rate, "--out", str(out)]) == FAULT
+    (found,) = by_method(out).values()
+    assert [estimate.frame_index for estimate in found] == list(range(PAIRS))
+    assert re.search(r"000005/right\.png: the PNG is truncated", found[5].reason)
+    told = capsys.readouterr()
+    assert "in 1 of 6 pairs" in told.out
+    (line,) = (line for line in told.err.splitlines() if not line.startswith("pairs:"))
+    assert re.match(r"droguekit: error: 1 pair has no result by a fault, first pair 5: .*000005/right\.png", line)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--filter", "--smooth"], ["--tracker", "bernoulli", "--filter"]],
+    ids=["plain", "filters", "tracker"],
+)
+@pytest.mark.parametrize("stage", ["observe", "measure", "estimate_measured"])
+def test_a_fault_of_ours_ends_one_pair_and_not_the_run(
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    stage: str,
+) -> None:
+    works, calls = getattr(PairNavigator, stage), []
+
+    def fails_once(self: PairNavigator, *given: Any) -> Any:
+        calls.append(stage)
+        if len(calls) == 1:
+            raise np.linalg.LinAlgError("singular\nmatrix")
+        return works(self, *given)
+
+    monkeypatch.setattr(PairNavigator, stage, fails_once)
+    out = tmp_path / "estimates.jsonl"
+    assert run(["navigate", str(flight), "--method", "joint", *options, "--out", str(out)]) == FAULT
+    for estimates in by_method(out).values():
+        assert [estimate.frame_index for estimate in estimates] == list(range(PAIRS))
+        assert estimates[0].reason == "internal fault, LinAlgError: singular matrix"
+        assert all(isinstance(estimate, PoseEstimate) for estimate in estimates[1:])
+    told = capsys.readouterr()
+    assert "in 1 of 6 pairs" in told.out
+    assert "first pair 0: internal fault, LinAlgError: singular matrix; --debug shows the trace" in told.err
+    assert "Traceback" not in told.err
+
+
+def test_debug_shows_the_trace_of_a_fault_within_a_pair(
+    flight: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(PairNavigator, "estimate_measured")
+    assert run(["navigate", str(flight), "--method", "joint", "--debug", "--out", str(tmp_path / "e.jsonl")]) == FAULT
+    assert [record.getMessage() for record in caplog.records] == [f"pair {index}" for index in range(PAIRS)]
+    assert all(record.exc_info[0] is AttributeError for record in caplog.records)
+
+
+@pytest.mark.parametrize("replaces", [False, True])
+def test_an_estimate_is_on_the_disk_before_the_next_pair_is_worked_on(
+    flight: Path, tmp_path: Path, replaces: bool
+) -> None:
+    out = tmp_path / "estimates.jsonl"
+    place = out.with_name("estimates.jsonl.part") if replaces else out
+    if replaces:
+        out.write_text("old")
+
+    class ReadingProgress(PlainProgress):
+        lines: ClassVar[list[int]] = []
+
+        def advance(self) -> None:
+            self.lines.append(len(list(read_estimates(place))))
+
+    navigate_dataset(flight, ["constant", "joint"], out, ReadingProgress(io.StringIO()))
+    assert ReadingProgress.lines == [2 * pair for pair in range(1, PAIRS + 1)]
+    assert len(list(read_estimates(out))) == 2 * PAIRS
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def library_threads() -> list[int]:
@@ -214,7 +286,8 @@ def test_an_interrupt_leaves_the_old_file_no_thread_and_all_settings(
         signal.signal(signal.SIGINT, handler)
         cv2.setNumThreads(cores)
     assert out.read_text() == "old"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimates.jsonl", "log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimates.jsonl", "estimates.jsonl.part", "log"]
+    assert [estimate.frame_index for estimate in read_estimates(tmp_path / "estimates.jsonl.part")][:2] == [0, 1]
     left = {t for t in set(threading.enumerate()) - threads if not t.name.startswith("other-eye")}
     assert left == set()
     assert set(progress.threads) == {1}

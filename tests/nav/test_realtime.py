@@ -193,16 +193,16 @@ def test_a_waiting_pair_is_late_when_a_newer_one_arrives(pairs: list[BlindPair])
         assert told_late == late
 
 
-def test_an_unreadable_pair_ends_the_replay_with_its_error(pairs: list[BlindPair]) -> None:
-    clock = SteppedClock()
-    source = DatasetInMemory(pairs, damaged={2})
-    answers = []
-    with pytest.raises(ValueError, match=r"frames/000002/left\.png: the PNG is truncated"):
-        for each in replay(source, open_navigator(SequenceSettings(("constant",)), "color-blob"), RATE_HZ, clock):
-            answers.append(each)
-            clock.answered()
-    # The pair is read ahead, while the one before may still be worked on.
-    assert [each.frame_index for each in answers] in ([0], [0, 1])
+@pytest.mark.parametrize("damaged", [0, 2, 6])
+def test_an_unreadable_pair_is_told_and_ends_nothing(pairs: list[BlindPair], damaged: int) -> None:
+    settings = SequenceSettings(("constant",))
+    navigator, clock = open_navigator(settings, "color-blob"), SteppedClock(in_turn=False)
+    answers = list(replay(DatasetInMemory(pairs, damaged={damaged}), navigator, RATE_HZ, clock))
+    assert [each.frame_index for each in answers] == list(range(len(pairs)))
+    message = f"frames/{damaged:06d}/left.png: the PNG is truncated"
+    assert [each.frame_index for each in answers if each.fault == message] == [damaged]
+    told = [e.frame_index for e in add_smoothed(answers, settings) if isinstance(e, NoFix) and e.reason == message]
+    assert told == [damaged]
 
 
 class FaultyDetector(ColorBlobDetector):
@@ -215,12 +215,30 @@ class FaultyDetector(ColorBlobDetector):
 
 
 @pytest.mark.parametrize("tracker", [None, "flow"])
-def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs: list[BlindPair], tracker: str | None) -> None:
-    clock = SteppedClock(in_turn=False)
+def test_a_fault_in_a_pair_does_not_end_the_replay(pairs: list[BlindPair], tracker: str | None) -> None:
+    clock = SteppedClock()
     settings = SequenceSettings(("constant",), tracker=tracker, redetect_every=1)
-    navigator = SequenceNavigator(settings, FaultyDetector)
-    with pytest.raises(RuntimeError, match="the run time of the network failed"):
-        list(replay(DatasetInMemory(pairs), navigator, RATE_HZ, clock))
+    navigator, answers = SequenceNavigator(settings, FaultyDetector), []
+    for each in replay(DatasetInMemory(pairs), navigator, RATE_HZ, clock):
+        answers.append(each)
+        clock.answered()
+    assert [each.frame_index for each in answers] == list(range(len(pairs)))
+    assert [each.fault for each in answers[:2]] == [
+        None,
+        "internal fault, RuntimeError: the run time of the network failed",
+    ]
+
+
+@pytest.mark.parametrize("tracker", [None, "flow"])
+def test_a_detector_that_cannot_be_made_ends_the_replay_and_all_threads(
+    pairs: list[BlindPair], tracker: str | None
+) -> None:
+    def no_detector(drogue: DrogueParameters) -> ColorBlobDetector:
+        raise ValueError("mine.onnx: is no network")
+
+    navigator = SequenceNavigator(SequenceSettings(("constant",), tracker=tracker), no_detector)
+    with pytest.raises(ValueError, match=r"mine\.onnx: is no network"):
+        list(replay(DatasetInMemory(pairs), navigator, RATE_HZ, SteppedClock(in_turn=False)))
 
 
 def test_closing_the_generator_stops_the_threads(pairs: list[BlindPair]) -> None:

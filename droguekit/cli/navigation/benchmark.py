@@ -9,7 +9,8 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, output_option
-from droguekit.workflows.benchmarking import DetectionOptions, benchmark_lines
+from droguekit.cli.main import FAULT
+from droguekit.workflows.benchmarking import DetectionOptions, run_benchmarks
 
 EXAMPLES = (
     "droguekit benchmark data/demo --estimates estimates.jsonl --json benchmark.json --html report.html",
@@ -49,10 +50,15 @@ def benchmark(
     """Compare pose estimates, or a detector's boxes, with the truth of a dataset.
 
     An imported dataset has no truth: its estimates are compared with their own measurements, and with boxes if any.
+    Exits with 1 where a detector fails in a pair, which then counts as without boxes.
     """
     options = DetectionOptions(detections or (), detector or (), split, threshold)
-    for line in benchmark_lines(dataset, estimates, options, (json_, html), progress_report()):
+    outcome = run_benchmarks(dataset, estimates, options, (json_, html), progress_report())
+    for line in outcome.lines:
         typer.echo(line)
     for path in (json_, html):
         if path is not None:
             typer.echo(f"wrote {path}")
+    if outcome.fault is not None:
+        typer.echo(f"droguekit: error: {outcome.fault}", err=True)
+        raise typer.Exit(FAULT)

@@ -9,6 +9,7 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
+from droguekit.cli.main import FAULT
 from droguekit.workflows.detection import detect_dataset
 
 EXAMPLES = (
@@ -37,7 +38,8 @@ def detect(
     """Find the drogue in every image of a dataset, from images, rig and drogue dimensions alone.
 
     Image ids are those of the dataset's annotations/all.json, even where there is no such file: twice the pair's index,
-    plus 1 for the left or 2 for the right image.
+    plus 1 for the left or 2 for the right image. Exits with 1 where a pair cannot be read or our own code fails in it;
+    it then has no boxes.
     """
     counts = detect_dataset(dataset, detector, out, least_score, progress_report(), tracker)
     typer.echo(
@@ -45,3 +47,6 @@ def detect(
         f"median {counts.times.wall_ms:.1f} ms a pair ({counts.times.cpu_ms:.1f} ms CPU)"
     )
     typer.echo(f"wrote {out}")
+    if counts.fault is not None:
+        typer.echo(f"droguekit: error: {counts.fault}", err=True)
+        raise typer.Exit(FAULT)

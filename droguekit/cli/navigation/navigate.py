@@ -51,8 +51,9 @@ def navigate(
 ) -> None:
     """Estimate the drogue's pose in every pair, from images, rig and drogue dimensions alone.
 
-    Pairs come from a dataset, or with --live from a running camera until Ctrl-C. Exits with 1 where a camera's run ends
-    by a fault; the estimates before it are kept.
+    Pairs come from a dataset, or with --live from a running camera until Ctrl-C. Each estimate is written as soon as it
+    exists. Exits with 1 where a pair cannot be read or our own code fails in it, which then gets no fix with that
+    reason, and where a camera's run ends by a fault.
     """
     files = None if not calibration else tuple(calibration)
     images = (files, calibration_unit, image_size, drogue, encoding, black_level, bits)

@@ -14,6 +14,7 @@ from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.results.detection_result import DetectedBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
+from nav.pair_faults import PairFaults, fault_reason, unreadable_reason
 
 LEAST_SCORE = 0.001
 """Boxes with at least this score are kept: average precision needs low scores too."""
@@ -28,6 +29,7 @@ class DetectorRunner:
         score_threshold: the detector's own threshold, or None.
         pass_sizes_px: width and height of a network's input in each of its passes; none where there is no network. [px]
         wall_s, cpu_s: time of each processed pair, without reading its images. [s]
+        faults: of pairs that cannot be read or in which the detector fails; they have no boxes.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class DetectorRunner:
         self.pairs = len(self._frame_indices)
         if not self.pairs:
             raise ValueError(f"{dataset}: has no pairs")
-        first = detector_of(self._dataset.pair(self._frame_indices[0]).drogue)
+        first = detector_of(self._dataset.sought_drogue(self._frame_indices[0]))
         self.name = first.name
         # Only networks name one.
         metadata = getattr(first, "metadata", None)
@@ -60,6 +62,7 @@ class DetectorRunner:
         self.pass_sizes_px: tuple[tuple[int, int], ...] = getattr(first, "pass_sizes_px", ())
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
+        self.faults = PairFaults()
 
     def boxes(self, least_score: float, advance: Callable[[], None]) -> Iterator[DetectedBox]:
         """Boxes of all images, clipped to them, pair by pair.
@@ -67,17 +70,24 @@ class DetectorRunner:
         Args:
             least_score: boxes that score less are left out.
             advance: called after each pair.
-
-        Raises:
-            ValueError: an image cannot be read; names the file.
         """
         for index in self._frame_indices:
-            pair = self._dataset.pair(index)
-            yield from self._detect(index, self._detector_of(pair.drogue), pair.images, least_score)
+            try:
+                pair = self._dataset.pair(index)
+            except ValueError as error:
+                self.faults.note(index, unreadable_reason(index, error))
+            else:
+                yield from self._detect(index, self._detector_of(pair.drogue), pair.images, least_score)
             advance()
 
     def times(self) -> PairTimes:
-        """Median times of the pairs so far."""
+        """Median times of the pairs so far.
+
+        Raises:
+            ValueError: the work on every pair ended by a fault; tells the first.
+        """
+        if not self.wall_s:
+            raise ValueError(self.faults.line() or "no pair was processed")
         wall_ms, cpu_ms = (1e3 * float(np.median(seconds)) for seconds in (self.wall_s, self.cpu_s))
         return PairTimes(wall_ms=wall_ms, cpu_ms=cpu_ms, pairs=len(self.wall_s))
 
@@ -85,7 +95,11 @@ class DetectorRunner:
         self, index: int, detector: Detector, images: StereoImages, least_score: float
     ) -> Iterator[DetectedBox]:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
-        found = detector.candidates(images, least_score)
+        try:
+            found = detector.candidates(images, least_score)
+        except Exception as error:
+            self.faults.note(index, fault_reason(index, error))
+            return
         self.wall_s.append(time.perf_counter() - wall_s)
         self.cpu_s.append(time.process_time() - cpu_s)
         for eye in EYES:
