@@ -16,8 +16,10 @@ from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
 _SEAM_DEPTH_FRACTION = 1e-5
-# A pixel on an edge takes the depth of the nearest surface within this distance.
-_NEAREST_PX = 2
+# Beyond these distances from a pixel whose centre sees nothing, the nearest depth is searched in the whole image.
+_NEAREST_PX = (1, 2)
+# Farther by this optical depth, a part that borders on a pixel counts in it.
+_EDGE_OPTICAL_DEPTH = 0.05
 
 
 @dataclass(eq=False)
@@ -76,7 +78,8 @@ class TracedEye:
     def apply_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Attenuate the light of parts by the air in front of them and add the air's own light, in place.
 
-        A pixel on an edge takes the depth of its nearest neighbour; haze hardly varies over the depth of the drogue.
+        Each pixel has the depth of what its centre sees. Where the centre misses, on an edge, the depth is that of the
+        parts nearest to it in the image.
 
         Args:
             air: (P, 3) radiance of infinitely deep air in the direction of each traced pixel. [cd/m2]
@@ -95,14 +98,39 @@ class TracedEye:
         """(P, 1) share of the light of parts that the air in front of pixels transmits; see `apply_air`."""
         if not len(pixel):
             return np.zeros((0, 1), dtype=np.float32)
-        width = self.depth_m.shape[1]
-        first, end = max(int(pixel.min()) // width - _NEAREST_PX, 0), int(pixel.max()) // width + _NEAREST_PX + 1
-        neighbours = np.ones((2 * _NEAREST_PX + 1, 2 * _NEAREST_PX + 1), dtype=np.uint8)
-        # By default OpenCV pads the image with finite numbers.
-        eroded = cv2.erode(self.depth_m[first:end], neighbours, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
-        nearest = eroded.reshape(-1)[pixel - first * width]
-        share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
+        depth_m = nearest_depth_m(self.depth_m, pixel)
+        share: NDArray[np.float32] = np.exp(-optical_depth_per_m * depth_m)
         return share[:, None]
+
+    def limit_edges(self, optical_depth_per_m: NDArray[np.float32]) -> None:
+        """Keep near edges, in place and after `apply_air`, within what the pixels around them show.
+
+        A pixel whose centre sees a near part may also show a farther one, whose light has then passed too little air:
+        in mist it is too dark. A mixture lies between its parts.
+
+        Args:
+            optical_depth_per_m: as in `apply_air`.
+        """
+        seen_m = np.where(np.isfinite(self.depth_m), self.depth_m, np.float32(0.0))
+        farther_m = cv2.dilate(seen_m, np.ones((3, 3), dtype=np.uint8)) - seen_m
+        near = farther_m.reshape(-1)[self.pixel] * optical_depth_per_m > _EDGE_OPTICAL_DEPTH
+        near &= self.part_id.reshape(-1)[self.pixel] > 0
+        if not near.any():
+            return
+        around = np.ones((5, 5), dtype=np.uint8)
+        whole = ~near & (self.coverage > 0)
+        covered = self.coverage[near, None]
+        for channel in range(3):
+            least = np.full(self.depth_m.shape, np.inf, dtype=np.float32)
+            level = self.radiance_cd_m2[whole, channel] / self.coverage[whole]
+            least.reshape(-1)[self.pixel[whole]] = level
+            most = np.where(np.isfinite(least), least, np.float32(-np.inf))
+            low = cv2.erode(least, around, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+            high = cv2.dilate(most, around, borderType=cv2.BORDER_CONSTANT, borderValue=-np.inf)
+            low, high = (bound.reshape(-1)[self.pixel[near]] for bound in (low, high))
+            own = self.radiance_cd_m2[near, channel]
+            limited = np.clip(own, low * covered[:, 0], high * covered[:, 0])
+            self.radiance_cd_m2[near, channel] = np.where(np.isfinite(low), limited, own)
 
     def composited_pixels(self, background: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P, 3) radiance of the traced pixels over a (H, W, 3) background. [cd/m2]"""
@@ -124,6 +152,45 @@ class TracedEye:
             normal=self.normal,
             amodal_px=self.amodal_px,
         )
+
+
+def nearest_depth_m(depth_m: NDArray[np.float32], pixel: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Depth at pixels, and where a centre sees nothing, that of what is nearest to it in the image.
+
+    The depth of a pixel does not depend on which others are asked for.
+
+    Args:
+        depth_m: (H, W) planar depth, infinite where nothing is seen. [m]
+        pixel: (P,) flat indices.
+
+    Returns:
+        (P,) depths, 0 in an image that shows nothing. [m]
+    """
+    found = depth_m.reshape(-1)[pixel]
+    width = depth_m.shape[1]
+    missed = np.flatnonzero(~np.isfinite(found))
+    for reach_px in _NEAREST_PX if missed.size else ():
+        rows = pixel[missed] // width
+        first, end = max(int(rows.min()) - reach_px, 0), int(rows.max()) + reach_px + 1
+        square = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
+        # By default OpenCV pads the image with finite numbers.
+        eroded = cv2.erode(depth_m[first:end], square, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+        found[missed] = eroded.reshape(-1)[pixel[missed] - first * width]
+        missed = missed[~np.isfinite(found[missed])]
+        if not missed.size:
+            break
+    if missed.size:
+        empty = ~np.isfinite(depth_m)
+        if empty.all():
+            found[missed] = 0.0
+            return found
+        _, label = cv2.distanceTransformWithLabels(
+            empty.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        depth_of_label = np.zeros(int(label.max()) + 1, dtype=np.float32)
+        depth_of_label[label[~empty]] = depth_m[~empty]
+        found[missed] = depth_of_label[label.reshape(-1)[pixel[missed]]]
+    return found
 
 
 def amodal_counts(

@@ -135,7 +135,9 @@ class BlenderEngine:
             half_differences[eye] = _HalfDifference(
                 pixel=difference.pixel, light=np.column_stack([difference.radiance_cd_m2, difference.coverage])
             )
-            traced[eye].apply_air(*air_in_front(frame, traced[eye].pixel))
+            air, optical_depth_per_m = air_in_front(frame, traced[eye].pixel)
+            traced[eye].apply_air(air, optical_depth_per_m)
+            traced[eye].limit_edges(optical_depth_per_m)
         eyes = {eye: traced[eye].composite_over(background[eye]) for eye in EYES}
         self._stage_s["composite"] += time.process_time() - started
         return self._stereo(eyes, _noise_fraction(half_differences, eyes, background))

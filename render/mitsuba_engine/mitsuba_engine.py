@@ -83,7 +83,9 @@ class MitsubaEngine:
         started = time.process_time()
         for eye in EYES:
             seen, duplicate = traced.eyes[eye], traced.duplicates[eye]
-            seen.apply_air(*air_in_front(frame, seen.pixel))
+            air, optical_depth_per_m = air_in_front(frame, seen.pixel)
+            seen.apply_air(air, optical_depth_per_m)
+            seen.limit_edges(optical_depth_per_m)
             traced.duplicate_error[eye] *= duplicate.apply_air(*air_in_front(frame, duplicate.pixel))
         noise = _noise(frame, traced, background)
         eyes = {eye: traced.eyes[eye].composite_over(background[eye]) for eye in EYES}

@@ -77,19 +77,81 @@ def test_airlight_is_the_background_where_nothing_can_be_seen() -> None:
         np.testing.assert_allclose(around.radiance(rays), around.airlight(rays), rtol=0.02)
 
 
+def untraced(depth_m: np.ndarray) -> TracedEye:
+    depth_m = depth_m.astype(np.float32)
+    return TracedEye.untraced(
+        part_id=np.isfinite(depth_m).astype(np.uint8),
+        depth_m=depth_m,
+        normal=np.zeros((*depth_m.shape, 3), dtype=np.float32),
+        amodal_px={},
+    )
+
+
+MIST_LIGHT_CD_M2, MIST_PER_M = 2000.0, 3.912 / 80.0
+NEAR_CD_M2, FAR_CD_M2 = (600.0, 600.0, 650.0), (900.0, 20.0, 20.0)
+
+
+def in_mist(depth_m: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """(H, W, 3) radiance behind mist of (H, W, 3) light at (H, W) depths; everything is covered."""
+    pixel = np.arange(depth_m.size)
+    covered = np.concatenate([light.reshape(-1, 3), np.ones((len(pixel), 1))], axis=1).astype(np.float32)
+    seen = untraced(depth_m).with_light(pixel, covered)
+    air = np.full((len(pixel), 3), MIST_LIGHT_CD_M2, dtype=np.float32)
+    per_m = np.full(len(pixel), MIST_PER_M, dtype=np.float32)
+    seen.apply_air(air, per_m)
+    seen.limit_edges(per_m)
+    return seen.radiance_cd_m2.reshape(light.shape)
+
+
+def test_air_in_front_of_a_far_thing_is_that_of_its_own_depth_beside_a_near_one() -> None:
+    """A probe 3 m away covers half of a drogue at 20 m in mist: up to the edge the drogue is as hazy as elsewhere."""
+    depth_m = np.full((9, 12), 20.0)
+    depth_m[:, :5] = 3.0
+    clear = np.exp(-MIST_PER_M * depth_m)[..., None]
+    light = np.where(depth_m[..., None] < 10, NEAR_CD_M2, FAR_CD_M2)
+    expected = light * clear + (1 - clear) * MIST_LIGHT_CD_M2
+    found = in_mist(depth_m, light)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("near_share", [0.0, 0.2, 0.49, 0.51, 0.8, 1.0])
+def test_a_pixel_on_an_edge_in_mist_is_not_darker_than_what_it_borders_on(near_share: float) -> None:
+    depth_m = np.full((9, 12), 20.0)
+    depth_m[:, : 5 if near_share < 0.5 else 6] = 3.0
+    light = np.where(np.arange(12)[None, :, None] < 5, NEAR_CD_M2, FAR_CD_M2) * np.ones((9, 1, 1))
+    light[:, 5] = near_share * np.array(NEAR_CD_M2) + (1 - near_share) * np.array(FAR_CD_M2)
+    found = in_mist(depth_m, light)
+    darker = found[4, [2, 9]].min(axis=0)
+    assert np.all(found[:, 5] > darker - 1) and np.all(found[:, 5] < MIST_LIGHT_CD_M2)
+
+
+def test_a_spoke_that_no_centre_hits_is_as_hazy_as_its_neighbours_beside_a_near_thing() -> None:
+    depth_m = np.full((9, 12), np.inf)
+    depth_m[:, :4] = 3.0
+    depth_m[:, 6] = 20.0
+    found = untraced(depth_m).air_transmittance(np.array([4 * 12 + 5]), np.full(1, MIST_PER_M, dtype=np.float32))
+    assert found[0, 0] == pytest.approx(np.exp(-MIST_PER_M * 20.0), rel=1e-6)
+
+
+def test_a_pixel_whose_centre_misses_has_the_air_of_what_is_nearest_to_it() -> None:
+    """However far a moving thing is smeared beyond its place at mid-exposure."""
+    depth_m = np.full((21, 60), np.inf)
+    depth_m[8:12, 4:9] = 15.0
+    depth_m[8:12, 40:] = 4.0
+    per_m = np.full(4, 0.05, dtype=np.float32)
+    pixel = np.ravel_multi_index((np.full(4, 10), np.array([9, 15, 20, 39])), depth_m.shape)
+    found = untraced(depth_m).air_transmittance(pixel, per_m)
+    np.testing.assert_allclose(found[:, 0], np.exp(-0.05 * np.array([15.0, 15.0, 15.0, 4.0])), rtol=1e-6)
+    nothing = untraced(np.full((21, 60), np.inf)).air_transmittance(pixel, per_m)
+    np.testing.assert_array_equal(nothing, 1.0)
+
+
 def test_a_pixel_is_as_hazy_alone_as_among_others() -> None:
     rng = np.random.default_rng(8)
-    depth_m = np.where(rng.random((12, 9)) < 0.6, np.inf, rng.uniform(5, 40, (12, 9))).astype(np.float32)
-    seen = TracedEye.untraced(part_id=depth_m > 0, depth_m=depth_m, normal=np.zeros((12, 9, 3)), amodal_px={})
+    depth_m = np.where(rng.random((12, 9)) < 0.9, np.inf, rng.uniform(5, 40, (12, 9))).astype(np.float32)
+    seen = untraced(depth_m)
     per_m = rng.uniform(0.01, 0.05, depth_m.size).astype(np.float32)
     all_of_them = seen.air_transmittance(np.arange(depth_m.size), per_m)
-    # By the definition: the nearest depth of the 25 pixels around, and clear air where none has one.
-    padded = np.pad(depth_m, 2, constant_values=np.inf)
-    nearest_m = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).min(axis=(2, 3)).ravel()
-    expected = np.exp(-per_m * np.where(np.isfinite(nearest_m), nearest_m, 0.0))
-    np.testing.assert_allclose(all_of_them[:, 0], expected, rtol=1e-6)
     for pixel in range(depth_m.size):
-        assert seen.air_transmittance(np.array([pixel]), per_m[[pixel]])[0, 0] == pytest.approx(
-            expected[pixel], rel=1e-6
-        )
+        assert seen.air_transmittance(np.array([pixel]), per_m[[pixel]])[0, 0] == all_of_them[pixel, 0]
     assert seen.air_transmittance(np.zeros(0, dtype=np.int64), per_m[:0]).shape == (0, 1)
