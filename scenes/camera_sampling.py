@@ -115,6 +115,7 @@ def _sample_processing(
         demosaic="edge-aware" if rng.random() < 0.7 else "bilinear",
         white_balance=(float(red), float(blue)),
         exposure_factor=float(np.clip(factor * 2.0 ** sample_uniform(rng, ranges.exposure_ev), 0.06, 20.0)),
+        brightest_mean_fraction=sample_uniform(rng, ranges.brightest_mean_fraction),
         contrast=sample_uniform(rng, ranges.contrast),
         black_fraction=sample_uniform(rng, ranges.black_fraction),
         saturation=sample_uniform(rng, ranges.saturation),

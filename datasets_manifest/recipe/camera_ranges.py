@@ -31,8 +31,8 @@ class CameraRanges(FrozenModel):
         window_scene_fraction: share of scenes behind a window with dirt, scratches, drops or reflections.
         white_balance_fraction: largest error of red and blue, either way.
         exposure_ev: error of the exposure. [powers of 2]
-        contrast, black_fraction, saturation, denoise_sigma_px, kept_detail_fraction, denoise_threshold, sharpen,
-            chroma_blur_px: see `ImageProcessing`.
+        brightest_mean_fraction, contrast, black_fraction, saturation, denoise_sigma_px, kept_detail_fraction,
+            denoise_threshold, sharpen, chroma_blur_px: see `ImageProcessing`.
         jpeg_scene_fraction, jpeg_quality: share of scenes coded as JPEG, and their quality.
         video_scene_fraction, video_quantizer: share of scenes coded as intra pictures of H.264, and their quantiser.
         resampled_scene_fraction, resolution_fraction: share of scenes coded at a lower resolution, and which.
@@ -53,6 +53,7 @@ class CameraRanges(FrozenModel):
     window_scene_fraction: Fraction = 0.25
     white_balance_fraction: float = Field(default=0.06, ge=0, le=0.5)
     exposure_ev: Range = Range(low=-0.5, high=0.4)
+    brightest_mean_fraction: Range = Range(low=0.2, high=0.4)
     contrast: Range = Range(low=-0.1, high=0.4)
     black_fraction: Range = Range(low=-0.02, high=0.04)
     saturation: Range = Range(low=0.7, high=1.35)
@@ -79,6 +80,7 @@ class CameraRanges(FrozenModel):
             ("scattered_fraction", 0, 0.5),
             ("bloom_fraction", 0, 0.5),
             ("exposure_ev", -3, 3),
+            ("brightest_mean_fraction", 0.02, 1),
             ("contrast", -0.5, 1),
             ("black_fraction", -0.2, 0.2),
             ("saturation", 0, 3),

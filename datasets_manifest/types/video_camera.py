@@ -57,6 +57,8 @@ class ImageProcessing(FrozenModel):
         demosaic: how the mosaic is interpolated.
         white_balance: (red, blue) wrong factors on the channels.
         exposure_factor: on the signal before the tone curve, whose slope at black it is; white stays white.
+        brightest_mean_fraction: linear level that the mean of both eyes' pictures may reach; a brighter view gets a
+            smaller exposure factor.
         contrast: of the S-shaped part of the tone curve; 0 is the sRGB curve alone, negative is flat.
         black_fraction: level of black in the picture; negative crushes shadows.
         saturation: factor on chroma.
@@ -70,6 +72,7 @@ class ImageProcessing(FrozenModel):
     demosaic: Literal["bilinear", "edge-aware"] = "edge-aware"
     white_balance: tuple[float, float] = (1.0, 1.0)
     exposure_factor: float = Field(default=1.0, gt=0.05, le=20)
+    brightest_mean_fraction: float = Field(default=1.0, gt=0.01, le=1)
     contrast: float = Field(default=0.0, ge=-0.5, le=1)
     black_fraction: float = Field(default=0.0, ge=-0.2, le=0.2)
     saturation: float = Field(default=1.0, ge=0, le=3)

@@ -134,8 +134,8 @@ def display_png(source: Dataset, frame_index: int, name: str, bits: ImageBits) -
     sensor = source.manifest.recipe.sensor
     black_level_dn = read_shutter(source.frames, frame_index).black_level_dn
     table = display_table(sensor.encoding, sensor.output_bits, black_level_dn, bits)
-    shown: Pixels = np.take(table, _pixels(source, frame_index, name), mode="clip")
-    return encode_png(shown)
+    shown = np.take(table, _pixels(source, frame_index, name), mode="clip")
+    return encode_png(shown.astype(np.uint8) if bits == 8 else shown.astype(np.uint16))
 
 
 def full_range_png(source: Dataset, frame_index: int, name: str) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import cv2
@@ -49,6 +50,25 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
     blue, red = (_blurred_chroma(plane, processing.chroma_blur_px) for plane in (blue, red))
     _finish(luma, _blurred(luma, processing.denoise_sigma_px), blue, red, detail, picture)
     return picture
+
+
+def metered(processing: ImageProcessing, frame: FrameSpec, raw: Sequence[NDArray[np.uint16]]) -> ImageProcessing:
+    """The processing of a pair: with a smaller exposure factor where the view is brighter than it may be.
+
+    Args:
+        processing: of the scene.
+        frame: gives the sensor.
+        raw: numbers of both eyes.
+    """
+    black, top = frame.sensor.black_level_dn, 2**frame.sensor.adc_bits - 1
+    mean = (sum(cv2.mean(numbers)[0] for numbers in raw) / len(raw) - black) / (top - black)
+    limit = processing.brightest_mean_fraction
+    factor = processing.exposure_factor
+    if factor * mean / (1.0 + (factor - 1.0) * mean) <= limit:
+        return processing
+    # Below a twentieth nothing would be left of a picture that is white all over.
+    factor = max(limit * (1.0 - mean) / (mean * (1.0 - limit)), 0.06)
+    return processing.model_copy(update={"exposure_factor": float(factor)})
 
 
 def noise_levels(frame: FrameSpec, processing: ImageProcessing) -> float:

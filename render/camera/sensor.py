@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import bulk_frame_generator
 from datasets_manifest.types.frame import FrameSpec, Sensor
 from datasets_manifest.types.images import Pixels, StereoImages, srgb_from_light
+from datasets_manifest.types.video_camera import ImageProcessing
 from geometry.stereo import EYES, Eye
 from render.camera.image_coding import deliver
-from render.camera.image_processing import develop
+from render.camera.image_processing import develop, metered
 from render.camera.optics import light_on_sensor
 from render.camera.sensor_readout import SensorReadout
 from render.engine import StereoRadiance
@@ -56,14 +57,19 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
         black_level_dn=sensor.black_level_dn,
         adc_bits=sensor.adc_bits,
     )
+    numbers: dict[Eye, NDArray[np.uint16]] = {}
     for index, eye in enumerate(EYES):
         seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
         light = _sample_sites(seen, frame)
         gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
         rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
-        numbers = readout.digital_numbers(light, gains, rng)
-        mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
-        images[eye] = _picture(numbers, frame)
+        numbers[eye] = readout.digital_numbers(light, gains, rng)
+        mosaics[eye] = _store(numbers[eye], sensor, "linear") if sensor.color == "bayer" else None
+    processing = None if frame.camera is None else frame.camera.processing
+    if processing is not None:
+        processing = metered(processing, frame, list(numbers.values()))
+    for eye in EYES:
+        images[eye] = _picture(numbers[eye], frame, processing)
     black_level = _store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)
     return StereoImages(
         left=images["left"],
@@ -78,10 +84,9 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
     )
 
 
-def _picture(numbers: NDArray[np.uint16], frame: FrameSpec) -> Pixels:
+def _picture(numbers: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessing | None) -> Pixels:
     """The image of an eye as it is stored: (H, W, 3), or (H, W) of a monochrome sensor."""
     sensor, camera = frame.sensor, frame.camera
-    processing = None if camera is None else camera.processing
     if processing is not None:
         picture: Pixels = develop(numbers, frame, processing)
     else:

@@ -30,7 +30,7 @@ _SHIFT = 4
 def display_picture(images: StereoImages) -> Picture:
     """(H, W, 3) left image in sRGB, for a screen."""
     table = display_table(images.encoding, images.bits, images.black_level_dn)
-    picture = np.take(table, images.left, mode="clip")
+    picture = np.take(table, images.left, mode="clip").astype(np.uint8)
     return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from datasets_manifest.types.frame import FrameSpec
-from datasets_manifest.types.images import Pixels
+from datasets_manifest.types.images import Pixels, light_from_srgb
 from datasets_manifest.types.video_camera import (
     ImageCoding,
     ImageProcessing,
@@ -256,6 +256,14 @@ def test_a_flat_colour_keeps_its_colour(frame: FrameSpec) -> None:
     plain = expose(with_camera(frame, None), light).left[20:-20, 20:-20].mean(axis=(0, 1))
     drawn = expose(with_camera(frame, VideoCamera(processing=ImageProcessing())), light).left
     np.testing.assert_allclose(drawn[20:-20, 20:-20].mean(axis=(0, 1)), plain, atol=1.0)
+
+
+@pytest.mark.parametrize("level", [0.2, 0.7])
+def test_a_bright_view_is_shown_no_brighter_than_asked(frame: FrameSpec, level: float) -> None:
+    camera = VideoCamera(processing=ImageProcessing(exposure_factor=1.8, brightest_mean_fraction=0.3))
+    shown = expose(with_camera(frame, camera), pair_of(flat_light(level), frame)).left[..., 1].mean() / 255
+    wanted = 0.3 if level == 0.7 else 1.8 * level / (1 + 0.8 * level)
+    assert light_from_srgb(np.array(shown)) == pytest.approx(wanted, rel=0.02)
 
 
 def test_infrared_darkens_the_sky_brightens_leaves_and_leaves_grey() -> None:
