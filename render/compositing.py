@@ -260,10 +260,15 @@ class Compositor:
 
     def shows(self, parts: NDArray[np.uint8], pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(P,) whether the pixels' centres see one of the parts that a (256,) table by part id marks."""
-        shows = np.zeros(len(pixel), dtype=np.bool_)
-        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
-            shows[own] = parts[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
+        shows: NDArray[np.bool_] = parts[self.part_ids(pixel)] > 0
         return shows
+
+    def part_ids(self, pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """(P,) what the pixels' centres see."""
+        seen = np.zeros(len(pixel), dtype=np.uint8)
+        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
+            seen[own] = self.eyes[eye].part_id.reshape(-1)[own_pixel]
+        return seen
 
     def by_eye(self, pixel: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], NDArray[np.int64]]]:
         """For each eye, (P,) which pixels are its own, and their flat indices in its image."""

@@ -17,7 +17,6 @@ from drogue_models.surroundings.hose_look import HoseLook
 from drogue_models.tankers.tanker import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
-from scenes.camera_sampling import camera_of_scene
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
@@ -96,7 +95,6 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
         "hose": family.hose,
         "receiver": family.receiver,
         "neighbours": family.neighbours,
-        "camera": family.camera,
     }
     return recipe.model_copy(update=changes)
 
@@ -135,8 +133,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     pose = kinematics.left_from_drogue
     if kinematics.sequence_id is not None:
         environment = _environment_of_sequence(environment, kinematics)
-    rig = scene_recipe.rig
-    sensor, camera = camera_of_scene(scene_recipe, scene_id)
+    rig, sensor = scene_recipe.rig, scene_recipe.sensor
     exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
     condition = None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue)
     neighbours = neighbours_of_frame(
@@ -167,7 +164,6 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         sensor=sensor,
         exposure=exposure,
         environment=environment,
-        camera=camera,
         rangefinder_reading_m=_rangefinder_reading_m(scene_recipe, frame_index, pose),
         loss=kinematics.loss,
     )

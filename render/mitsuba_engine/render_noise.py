@@ -121,8 +121,8 @@ class NoiseBudget:
 
     Attributes:
         aim: mean square error that is aimed at. [cd2/m4]
-        light_error: (2,) mean square error by the denoised light, where the sky is hidden and in the open
-            (`OPEN_TO_SKY`). A caller that lessens the error updates it. [cd2/m4]
+        light_error: (G,) mean square error by the denoised light on each group of parts. A caller that lessens the
+            error updates it. [cd2/m4]
     """
 
     def __init__(
@@ -131,6 +131,7 @@ class NoiseBudget:
         edges: tuple[NDArray[np.int64], NDArray[np.float32]],
         interior: tuple[NDArray[np.int64], NDArray[np.float32]],
         noise_over_sensor: float,
+        group_of_part: NDArray[np.uint8] = OPEN_TO_SKY,
     ) -> None:
         """Evaluate pilot rays.
 
@@ -140,6 +141,7 @@ class NoiseBudget:
                 light by S single rays through each.
             interior: (Q,) flat indices of the other pixels that are traced twice, and (Q, 7) the same of each.
             noise_over_sensor: noise of the renderer that is aimed at, over the noise of the sensor.
+            group_of_part: (256,) groups by part id: usually 0 where the sky is hidden and 1 in the open.
         """
         edge_pixel, edge_rays = edges
         interior_pixel, interior_light = interior
@@ -154,8 +156,9 @@ class NoiseBudget:
         errors = np.concatenate([clear * edge_rays[..., 4:].mean(axis=1), interior_clear * interior_light[:, 4:]])
         self.aim = noise_over_sensor**2 * sensor.variance(mean[None])
         squared = np.mean((errors @ sensor.weights) ** 2, axis=-1) * weight / weight.sum()
-        is_open = np.concatenate([compositor.shows(OPEN_TO_SKY, pixel) for pixel in (edge_pixel, interior_pixel)])
-        self.light_error: NDArray[np.float64] = np.bincount(is_open, weights=squared, minlength=2).astype(np.float64)
+        seen = compositor.part_ids(np.concatenate([edge_pixel, interior_pixel]))
+        errors_by_group = np.bincount(group_of_part[seen], weights=squared, minlength=int(group_of_part.max()) + 1)
+        self.light_error: NDArray[np.float64] = errors_by_group.astype(np.float64)
         variance = np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1)
         # A few rays miss small things, which those of neighbouring pixels may have hit.
         nearby = np.empty(len(variance))

@@ -21,6 +21,7 @@ from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px
 from render.compositing import Compositor, TracedEye, amodal_counts
 from render.mitsuba_engine.jit_arrays import jit_array, reserve_registry
+from render.mitsuba_engine.paths.body_paths import DenoisedBodyPaths
 from render.mitsuba_engine.paths.context_paths import SeenContext, trace_context
 from render.mitsuba_engine.paths.denoised_paths import DenoisedPaths
 from render.mitsuba_engine.paths.drogue_paths import trace_paths
@@ -102,10 +103,11 @@ def _sample_light(
     open_to_sky[list(scene.shiny_parts)] = 0
     rays, moves_px = FrameRays(frame, scene, request.ambient, open_to_sky), motion_blur_px(frame)
     if denoise:
-        assert frame.left_from_drogue is not None
+        assert frame.drogue is not None and frame.left_from_drogue is not None
         px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
         compositor = Compositor(frame=frame, eyes=eyes, background=request.background)
-        sampled = DenoisedPaths(rays, settings, px_per_m, moves_px).trace(plans, centers, compositor)
+        kind = DenoisedPaths if frame.drogue.body is None else DenoisedBodyPaths
+        sampled = kind(rays, settings, px_per_m, moves_px).trace(plans, centers, compositor)
     else:
         sampled = trace_paths(rays, plans, settings)
     pixel = rays.pixels_of_both_eyes(plans, "context")

@@ -26,16 +26,16 @@ from render.mitsuba_engine.paths.rays import (
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct
 from render.mitsuba_engine.paths.surface_light import SMOOTHING_M, SurfaceLight
 from render.mitsuba_engine.render_noise import DUPLICATE_EVERY, PILOT_COUNT, NoiseBudget
-from render.mitsuba_engine.trace_request import SamplingPlan
+from render.mitsuba_engine.trace_request import OPEN_TO_SKY, SamplingPlan
 
 MOST_SMOOTHING_STEPS = 2.5
 """Largest standard deviation of the smoothing, in steps from one traced pixel centre to the next."""
 # `samples_per_px` paths are traced where the smoothing is this wide; narrower smoothing takes more.
 _SMOOTHING_AT_COUNT_PX = 2.4
-# Share of the squared noise that is aimed at which the denoised light may have after it is traced again.
-_LIGHT_SHARE = 0.5
-# Light is traced again only with at least so many times the paths, and with at most so many times.
-_LEAST_TIMES, _MOST_TIMES = 1.5, 16.0
+LIGHT_SHARE = 0.5
+"""Share of the squared noise that is aimed at which the denoised light may have after it is traced again."""
+LEAST_TIMES, MOST_TIMES = 1.5, 16.0
+"""Light is traced again only with at least so many times the paths, and with at most so many times."""
 # A group of centres with less than this share of the light's squared error takes no more paths: they would not show.
 _LEAST_ERROR_SHARE = 0.1
 
@@ -67,7 +67,7 @@ class DenoisedPaths:
             px_per_m: scale of the image at the drogue. [px/m]
             moves_px: largest motion of the image from mid-exposure to either end. [px]
         """
-        self._rays, self._settings, self._moves_px = rays, settings, moves_px
+        self._rays, self._settings, self._moves_px, self._px_per_m = rays, settings, moves_px, px_per_m
         self._sigma_px = min(SMOOTHING_M * px_per_m, MOST_SMOOTHING_STEPS)
 
     def trace(
@@ -83,18 +83,31 @@ class DenoisedPaths:
         """
         interior = self._planned(plans, ("open", "sheltered", "deep"))
         edges = self._planned(plans, ("edges", "deep_edges"))
-        centered = self._trace_centers(centers)
-        interior_light, edge_counts = self._interior_light(centered.light, interior), np.zeros(0, dtype=np.int64)
-        if len(edges):
-            interior_light, budget = self._meet_budget(centered, compositor, edges, (interior, interior_light))
-            edge_counts = budget.edge_counts(self._settings.edge_samples_per_px)
-        edge_light = denoised_edge_light(
-            self._rays, centered.light, with_duplicates(edges), with_duplicates(edge_counts)
-        )
+        light, interior_light, edge_counts = self._trace_light_of(centers, compositor, edges, interior)
+        edge_light = denoised_edge_light(self._rays, light, with_duplicates(edges), with_duplicates(edge_counts))
         return _without_duplicates([(interior, interior_light), (edges, edge_light)])
 
     def _planned(self, plans: dict[Eye, SamplingPlan], kinds: tuple[str, ...]) -> NDArray[np.int64]:
         return np.concatenate([self._rays.pixels_of_both_eyes(plans, kind) for kind in kinds])
+
+    def _trace_light_of(
+        self,
+        centers: dict[str, NDArray[np.int64]],
+        compositor: Compositor,
+        edges: NDArray[np.int64],
+        interior: NDArray[np.int64],
+    ) -> tuple[SurfaceLight, NDArray[np.float32], NDArray[np.int64]]:
+        """Trace the indirect light at centres until it is as little noisy as `edges` and `interior` pixels need.
+
+        Returns:
+            The light, its result for the interior pixels, and how many rays each pixel with an edge takes.
+        """
+        centered = self._trace_centers(centers)
+        interior_light = self._interior_light(centered.light, interior)
+        if not len(edges):
+            return centered.light, interior_light, np.zeros(0, dtype=np.int64)
+        interior_light, budget = self._meet_budget(centered, compositor, edges, (interior, interior_light))
+        return centered.light, interior_light, budget.edge_counts(self._settings.edge_samples_per_px)
 
     def _trace_centers(self, centers: dict[str, NDArray[np.int64]]) -> _CenterLight:
         """Indirect light at the pixel centres, smoothed where the sky is hidden."""
@@ -140,7 +153,7 @@ class DenoisedPaths:
         light, hidden = centered.light, centered.hidden
         pixel, interior_light = interior
         budget = self._budget(light, compositor, edges, (pixel, interior_light))
-        if budget.light_error.sum() > _LEAST_TIMES * _LIGHT_SHARE * budget.aim:
+        if budget.light_error.sum() > LEAST_TIMES * LIGHT_SHARE * budget.aim:
             # In this frame something close hides the sky also from parts that are usually in the open.
             light.smooth(~hidden, MOST_SMOOTHING_STEPS)
             interior_light = self._interior_light(light, pixel)
@@ -156,8 +169,8 @@ class DenoisedPaths:
             Whether it was traced again.
         """
         paths = centered.paths
-        times = min(budget.light_error.sum() / (_LIGHT_SHARE * budget.aim), _MOST_TIMES)
-        if times <= _LEAST_TIMES:
+        times = min(budget.light_error.sum() / (LIGHT_SHARE * budget.aim), MOST_TIMES)
+        if times <= LEAST_TIMES:
             return False
         more = paths * np.where(budget.light_error > _LEAST_ERROR_SHARE * budget.light_error.sum(), times, 1.0)
         self._trace_light(centered.light, centered.hidden, more)
@@ -175,6 +188,7 @@ class DenoisedPaths:
         compositor: Compositor,
         edges: NDArray[np.int64],
         interior: tuple[NDArray[np.int64], NDArray[np.float32]],
+        group_of_part: NDArray[np.uint8] = OPEN_TO_SKY,
     ) -> NoiseBudget:
         """From pilot rays through pixels with edges, and the light of interior pixels."""
         pixel, interior_light = interior
@@ -183,6 +197,7 @@ class DenoisedPaths:
             edges=(edges, pilot_rays(self._rays, light, edges)),
             interior=(pixel[::DUPLICATE_EVERY], interior_light[len(pixel) :]),
             noise_over_sensor=self._settings.noise_over_sensor,
+            group_of_part=group_of_part,
         )
 
 

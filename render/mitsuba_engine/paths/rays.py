@@ -221,14 +221,15 @@ class StratifiedSamples:
     """
 
     def __init__(self, rays: FrameRays, pixel: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
-        """Take (P,) flat indices, and how many samples each pixel takes: multiples of `LEAST_COUNT`."""
+        """Take (P,) flat indices, and how many samples each pixel takes."""
+        self.total = int(counts.sum())
         self._counts, self._first = counts, np.cumsum(counts) - counts
         row = jit_array(mi.UInt32, np.repeat(np.arange(len(pixel), dtype=np.uint32), counts))
 
         def of_row(values: NDArray[np.generic]) -> mi.UInt32:
             return dr.gather(mi.UInt32, jit_array(mi.UInt32, values), row)
 
-        index = dr.arange(mi.UInt32, int(counts.sum())) - of_row(self._first)
+        index = dr.arange(mi.UInt32, self.total) - of_row(self._first)
         flips = rays.random_bits(3, len(pixel))
         self.pixel = of_row(pixel)
         self.place = mi.Point2f(
@@ -241,8 +242,9 @@ class StratifiedSamples:
         """(P, len(channels)) means over the samples of each pixel."""
         # Without this evaluation every sum would trace the rays again.
         dr.eval(channels)
-        first = self._first // LEAST_COUNT
-        sums = [np.add.reduceat(np.array(dr.block_sum(channel, LEAST_COUNT)), first) for channel in channels]
+        block = LEAST_COUNT if not (self._counts % LEAST_COUNT).any() else 1
+        blocks = [dr.block_sum(channel, block) if block > 1 else channel for channel in channels]
+        sums = [np.add.reduceat(np.array(values), self._first // block) for values in blocks]
         means: NDArray[np.float32] = np.stack(sums, axis=-1) / self._counts[:, None].astype(np.float32)
         return means
 

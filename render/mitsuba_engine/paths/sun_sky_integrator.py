@@ -61,7 +61,7 @@ def trace_direct(scene: Any, lights: SceneLights, ray: Any) -> tuple[Any, Any, A
     """
     surface = scene.ray_intersect(ray, mi.RayFlags.All, True)
     hit = surface.is_valid()
-    radiance = _emitted_and_sunlight(scene, lights, surface, hit)
+    radiance = emitted_and_sunlight(scene, lights, surface, hit)
     number: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
     known = dr.gather(mi.Float, lights.open_to_sky, number, hit)
     front = hit & (surface.wi.z > 0)
@@ -93,19 +93,19 @@ def trace_residual(scene: Any, lights: SceneLights, sampler: Any, first: tuple[A
         ray = surface.spawn_ray(surface.to_world(sample.wo))
         surface = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         hit = active & surface.is_valid()
-        total += weight * _unknown_sky(scene, ray, active, hit, known)
-        total += weight * _emitted_and_sunlight(scene, lights, surface, hit, lights.lights_others)
+        total += weight * unknown_sky(scene, ray, active, hit, known)
+        total += weight * emitted_and_sunlight(scene, lights, surface, hit, lights.lights_others)
         active, known = hit, mi.Float(0.0)
     sample, share = surface.bsdf().sample(context, surface, sampler.next_1d(), sampler.next_2d(), active)
     weight *= share
     active &= dr.max(weight) > 0.0
     ray = surface.spawn_ray(surface.to_world(sample.wo))
     hit = active & scene.ray_test(ray, active)
-    total += weight * _unknown_sky(scene, ray, active, hit, known)
+    total += weight * unknown_sky(scene, ray, active, hit, known)
     return dr.select(dr.isfinite(total), total, 0.0)
 
 
-def _emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any, shown: Any = None) -> Any:
+def emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any, shown: Any = None) -> Any:
     """Radiance of surfaces towards the ray's origin, by lamps and by sunlight alone; `shown` is a factor by shape."""
     towards = surface.to_local(lights.to_sun)
     in_sun = hit & (towards.z > 0) & (surface.wi.z > 0)
@@ -120,7 +120,7 @@ def _emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: An
     return radiance
 
 
-def _unknown_sky(scene: Any, ray: Any, active: Any, hit: Any, known: Any) -> Any:
+def unknown_sky(scene: Any, ray: Any, active: Any, hit: Any, known: Any) -> Any:
     """The sky's radiance along rays that miss, less the share of it that is already counted as known."""
     end = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
     end.wi = -ray.d

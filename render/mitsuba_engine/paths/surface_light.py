@@ -91,6 +91,10 @@ class SurfaceLight:
             place = np.flatnonzero(mask)
             # Each pixel twice: the samples of one pixel are stratified, so that their halves would not be independent.
             halves[:, place, :3] = self._trace_means(np.tile(self.pixel[place], 2), count, max_depth).reshape(2, -1, 3)
+        self._keep(halves)
+
+    def _keep(self, halves: NDArray[np.float32]) -> None:
+        """Take two independent estimates of the light, (2, P + 257, 4), as the light so far."""
         for half in halves:
             half[self._none + 1 :] = self._part_means(half[: self._none])
         mean, error = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
