@@ -1,15 +1,19 @@
-"""Files and folders that appear whole or not at all, and locks between processes."""
+"""Files and folders that appear whole or not at all, temporary folders, and locks between processes."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TextIO, cast
+
+MEMORY_FOLDER = Path("/dev/shm")
+"""A folder that lies in memory, where there is one."""
 
 PART_SUFFIX = ".part"
 """Suffix of everything that is still being written; such names also begin with a dot."""
@@ -120,6 +124,43 @@ def new_folder(out: Path) -> Iterator[Path]:
         raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def make_scratch_folder(folder: Path | None = None) -> Path:
+    """A new temporary folder of this process; whoever kills the process removes it with `remove_scratch_folders`.
+
+    Args:
+        folder: to make it in; None for the system's, which TMPDIR names.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    return Path(tempfile.mkdtemp(prefix=_scratch_prefix(os.getpid()), dir=folder))
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A temporary folder for the duration of the block.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    folder = make_scratch_folder()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_scratch_folders(process: int) -> None:
+    """Remove the temporary folders of a process that was killed."""
+    for place in (Path(tempfile.gettempdir()), MEMORY_FOLDER):
+        for folder in place.glob(f"{_scratch_prefix(process)}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _scratch_prefix(process: int) -> str:
+    return f"droguekit-{process}-"
 
 
 def try_lock(file: IO[str]) -> bool:

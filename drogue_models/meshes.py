@@ -31,10 +31,12 @@ from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.parameters import BodyMesh, DrogueParameters
 from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, pocketed_plate, revolve
+from drogue_models.untrusted_files import read_regular
 from geometry.se3 import Array
 
 # Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
 _SMALLEST_BODY_M, _LARGEST_BODY_M = 0.05, 10.0
+_ARCHIVES = {"bz2", "gz", "tar.bz2", "tar.gz", "zip", "3mf", "3dxml", "zae"}
 # float32 files round a front at z = 0 by this much for bodies of a few metres.
 _FRONT_TOLERANCE_M = 1e-6
 
@@ -48,7 +50,7 @@ def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
     """
     file = body.file
     try:
-        data = file.read_bytes()
+        data = read_regular(file)
     except OSError as error:
         raise ValueError(
             f"body_mesh: {file} cannot be read: {error.strerror}; a drogue from a dataset looks for its mesh in the "
@@ -68,7 +70,8 @@ def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
 
 
 def _parse_body_mesh(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
-    readable = sorted(trimesh.available_formats())
+    # An archive of a megabyte can hold gigabytes.
+    readable = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if file_type not in readable:
         raise ValueError(f"body_mesh: {name} is of a kind that cannot be read; use one of {', '.join(readable)}")
     try:

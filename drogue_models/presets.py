@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import tomllib
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +17,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from drogue_models.frozen_model import FrozenModel, Metres
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters, HubParameters, PlanePoint, even_ring
 from drogue_models.parts import MAX_MARKERS
+from drogue_models.untrusted_files import parse_toml, read_regular, read_text
 
 # The largest even ring that leaves 10 mm of dark face around markers of 0.10 m inside a rim of 0.33 m.
 RING_RADIUS_M = 0.27
@@ -78,10 +78,10 @@ def load_drogue(name_or_path: str, base: Path | None = None) -> DrogueParameters
         )
     path = (base or Path()) / name_or_path
     try:
-        return parse_drogue(path.read_text(encoding="utf-8"), path.parent)
+        return parse_drogue(read_text(path), path.parent)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from error
     except ValidationError as error:
         raise ValueError(f"{path}: {explain(error)}") from error
@@ -99,7 +99,7 @@ def parse_drogue(text: str, folder: Path) -> DrogueParameters:
     Raises:
         ValueError: not TOML, or keys are wrong.
     """
-    table = tomllib.loads(text)
+    table = parse_toml(text)
     _expand_ring(table)
     _expand_rings(table)
     _pin_body_mesh(table, folder)
@@ -165,7 +165,7 @@ def _pin_body_mesh(table: dict[str, Any], folder: Path) -> None:
     if not isinstance(given, str) or not given:
         raise ValueError(f"body_mesh: must be the path of a mesh file, got {given!r}")
     try:
-        data = (folder / given).read_bytes()
+        data = read_regular(folder / given)
     except OSError as error:
         raise ValueError(f"body_mesh: {folder / given} cannot be read: {error.strerror}; correct the path") from error
     table["body_mesh"] = {"path": given, "sha256": hashlib.sha256(data).hexdigest(), "folder": folder}

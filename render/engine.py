@@ -108,6 +108,15 @@ def engine_notice(name: str, device: Device = "cpu") -> str | None:
     return None if variant.variant != "scalar_rgb" else f"engine mitsuba runs as {variant.variant}: {variant.reason}"
 
 
+def crash_advice(name: str) -> str:
+    """What to do where the engine's native code ends its process again and again; empty where nothing is known."""
+    if name != "mitsuba":
+        return ""
+    from render.mitsuba_engine.variant import kernel_cache
+
+    return f"; if it stays so, delete {kernel_cache()}, its cache of compiled kernels, which may be damaged"
+
+
 def _check_device(name: str, device: Device) -> None:
     if device not in DEVICES:
         raise ValueError(f"device: must be {' or '.join(DEVICES)}, got {device!r}")

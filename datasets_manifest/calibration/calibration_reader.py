@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +17,21 @@ from datasets_manifest.calibration.camera_chain import (
     rig_of_sensor_files,
 )
 from datasets_manifest.calibration.camera_info import camera_info_of_table, is_camera_info, rig_of_camera_info
-from datasets_manifest.calibration.opencv_storage import is_table_of_matrices, read_opencv_storage, rig_of_tables
+from datasets_manifest.calibration.opencv_storage import (
+    is_table_of_matrices,
+    read_calibration_text,
+    read_opencv_storage,
+    rig_of_tables,
+)
 from geometry.stereo import StereoRig
 
 _KNOWN = (
     "OpenCV's stereo calibration (M1, D1, M2, D2, R, T), Kalibr's camchain, ROS's camera_info of both cameras, EuRoC's "
     "sensor.yaml of both cameras, or ORB-SLAM's settings"
 )
-# A calibration has a few kilobytes; whatever is larger is something else.
-_LARGEST_BYTES = 1_000_000
+# A calibration has a few kilobytes. Its reader takes a kilobyte of memory for every value.
+_LARGEST_YAML = 2**18
+_MOST_VALUES = 100_000
 _OPENCV_BEGINNINGS = ("<?xml", "{")
 _MATRIX_TAG = "!!opencv-matrix"
 
@@ -89,16 +96,32 @@ def _check_count(paths: Sequence[Path], count: int, rule: str) -> None:
 
 
 def _text(path: Path) -> str:
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such calibration file")
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise ValueError(f"{path}: is too large for a calibration; give {_KNOWN}")
-        return path.read_text(encoding="utf-8-sig")
+        return read_calibration_text(path)
     except OSError as error:
+        if isinstance(error, FileNotFoundError | IsADirectoryError):
+            raise ValueError(f"{path}: there is no such calibration file") from error
+        if error.errno == errno.EFBIG:
+            raise ValueError(f"{path}: is too large for a calibration; give {_KNOWN}") from error
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not a text file; give {_KNOWN}") from error
+
+
+def _check_value_count(table: object) -> None:
+    """Refuse a table whose references stand for more values than it holds, or for itself.
+
+    Raises:
+        ValueError: it stands for too many.
+    """
+    waiting, count = [table], 0
+    while waiting:
+        value = waiting.pop()
+        inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple | set) else ()
+        waiting += inner
+        count += 1
+        if count > _MOST_VALUES or len(waiting) > _MOST_VALUES:
+            raise ValueError(f"stands for more than {_MOST_VALUES} values")
 
 
 def _is_opencv_storage(text: str) -> bool:
@@ -108,10 +131,13 @@ def _is_opencv_storage(text: str) -> bool:
 
 def _table(text: str, path: Path) -> Mapping[str, Any]:
     """The first document of a YAML file."""
+    if len(text) > _LARGEST_YAML:
+        raise ValueError(f"{path}: is too large for a calibration; give {_KNOWN}")
     # OpenCV's header is no directive of YAML.
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
     try:
         table = next(iter(yaml.safe_load_all("\n".join(lines))), None)
+        _check_value_count(table)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not YAML: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(table, Mapping):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from datasets_manifest.calibration.stereo_calibration import (
     rig_of_cameras,
     rig_of_rectification,
 )
+from drogue_models.untrusted_files import read_text
 from geometry.distortion import Lens
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
@@ -36,6 +38,12 @@ _NAMES = {
 _RECTIFICATION = ("R1", "R2", "P1", "P2")
 _POSE = ("R", "T")
 _ORB_SLAM_KEY = "LEFT.K"
+
+# A calibration opens a bracket or a tag for each of some dozen matrices, and for each view where it holds the points.
+_MOST_OPENED = 2000
+_XML_TAG = re.compile(r"<[\w]")
+# Lists within lists of YAML without brackets are opened by dashes or spaces at the beginning of a line.
+_DEEP_BLOCK = re.compile(r"^[ \t?:-]{400}", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,10 +123,25 @@ def rig_of_tables(
     return rig_of_cameras(left, right, right_from_left, found["T"].name), False
 
 
+def read_calibration_text(path: Path) -> str:
+    """The text of a calibration file, nested so little that no parser overflows its stack.
+
+    Raises:
+        OSError: it is no regular file, or too large.
+        ValueError: it is not UTF-8, or nested too deep.
+    """
+    text = read_text(path)
+    # An upper limit of the depth, which is the same in YAML, XML and JSON.
+    opened = max(text.count("["), text.count("{"), len(_XML_TAG.findall(text)))
+    if opened > _MOST_OPENED or _DEEP_BLOCK.search(text):
+        raise ValueError(f"{path}: is nested too deep for a calibration")
+    return text
+
+
 def _storage_table(path: Path) -> dict[str, Any]:
     """All entries of a file of `cv2.FileStorage`: arrays, numbers, texts, or lists of numbers."""
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        storage = cv2.FileStorage(read_calibration_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         keys = storage.root().keys()
         return {key: _value(storage.getNode(key)) for key in keys}
     except (cv2.error, SystemError, OverflowError, ValueError, UnicodeDecodeError) as error:

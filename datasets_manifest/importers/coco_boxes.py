@@ -7,7 +7,6 @@ that were uploaded.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from datasets_manifest.types.records import PixelBox
+from drogue_models.untrusted_files import MOST_BYTES, parse_json, read_text
 
 _DROGUE = "drogue"
 
@@ -159,14 +159,14 @@ def read_boxes(path: Path, category: str | None = None) -> DrawnBoxes:
             names the file, and the annotation.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = parse_json(read_text(path, MOST_BYTES), with_nan=True)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     try:
         return DrawnBoxes(path, tuple(_drawn_boxes(table, category)))
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path}: is not a COCO file of boxes: {type(error).__name__} {error}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

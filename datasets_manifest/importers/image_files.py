@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from datasets_manifest.storage.image_codecs import check_pixel_count
+from datasets_manifest.storage.image_codecs import check_image_size
 from datasets_manifest.types.images import Pixels
+from drogue_models.untrusted_files import read_regular
 
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 
@@ -32,7 +33,7 @@ def read_image(path: Path) -> tuple[Pixels, bool]:
         ValueError: it cannot be read or decoded; names the file.
     """
     try:
-        data = np.fromfile(path, dtype=np.uint8)
+        data = np.frombuffer(read_regular(path), dtype=np.uint8)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     return decode_image_file(data, str(path))
@@ -71,13 +72,14 @@ def _check_size(data: NDArray[np.uint8], name: str) -> None:
     """Refuse an image that would fill the memory; what Pillow cannot identify is left to OpenCV."""
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data.tobytes())) as image:
-            width_px, height_px = image.size
+            # Pillow reads some images of 16 bits as ones of 8.
+            (width_px, height_px), bytes_per_px = image.size, 2 * len(image.getbands())
     except Image.DecompressionBombError as error:
         raise ValueError(f"{name}: has too many pixels: {error}") from error
     except Exception:  # whatever a damaged file makes its reader raise
         return
     try:
-        check_pixel_count(width_px, height_px)
+        check_image_size(width_px, height_px, bytes_per_px, len(data))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 

@@ -13,6 +13,7 @@ from typing import Final
 from datasets_manifest.importers.image_files import IMAGE_SUFFIXES, read_image
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.stamp_pairs import match_stamps
+from drogue_models.untrusted_files import MOST_BYTES, read_text
 from geometry.stereo import EYES
 
 # Folders of the left and the right view in small letters, besides those that say left and right.
@@ -282,7 +283,7 @@ def _listed_times(folder: Path, names: list[str]) -> tuple[list[int] | None, str
         if not path.is_file():
             continue
         try:
-            lines = path.read_text(encoding="utf-8").split("\n")
+            lines = read_text(path, MOST_BYTES).split("\n")
             while lines and not lines[-1].strip():
                 lines.pop()
             times_ns = [_line_time(line.strip()) for line in lines]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from datasets_manifest.types.frame import Sensor
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
+from drogue_models.untrusted_files import parse_toml, read_text
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
@@ -358,9 +358,11 @@ def load_recipe(name_or_path: str, seed: int | None = None, changes: Mapping[str
             )
         base = path.parent
         try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}: cannot be read: {error}") from error
+            text = read_text(path)
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: not valid TOML: {error}") from error
     try:
         return RecipeSource(parse_recipe(text, base, seed, changes), text)
     except ValueError as error:
@@ -382,11 +384,7 @@ def parse_recipe(
     Raises:
         ValueError: not TOML, or keys are wrong; names each key.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"not valid TOML: {error}") from error
-    table = _with_changes(table, changes or {})
+    table = _with_changes(parse_toml(text), changes or {})
     if seed is not None:
         table["seed"] = seed
     drogue = table.get("drogue", "red-8")

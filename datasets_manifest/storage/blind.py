@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -19,6 +18,7 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
+from drogue_models.untrusted_files import parse_json
 from geometry.stereo import StereoRig
 
 
@@ -78,12 +78,12 @@ def read_blind_index(dataset: Location) -> BlindIndex:
             frames=tuple(sorted(entry.frame_index for entry in manifest.frames)),
         )
     try:
-        return BlindIndex.model_validate(json.loads(storage.read(BLIND_FILE)))
+        return BlindIndex.model_validate(parse_json(storage.read(BLIND_FILE)))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
         raise ValueError(f"{path}: {explain(error)}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
 
 

@@ -18,6 +18,7 @@ from datasets_manifest.storage.layout import (
     SHARDS_FILE,
     SHARDS_FOLDER,
     frame_name,
+    frame_of_name,
     is_plain_name,
     shard_file,
     shard_index_file,
@@ -67,7 +68,7 @@ class FrameStore:
     def staged(self) -> frozenset[int]:
         """Indices of the frames that have folders of their own."""
         folders = self.storage.folders_with(FRAMES_FOLDER, RECORD_FILE)
-        return frozenset(int(name) for name in folders if name.isdecimal())
+        return frozenset(index for index in map(frame_of_name, folders) if index is not None)
 
     def names(self, frame_index: int) -> list[str]:
         """Names of the files of a frame, sorted.
@@ -98,7 +99,7 @@ class FrameStore:
                 raise ValueError(f"{self.where(frame_index, name)}: leads outside the frame's folder")
             shard = self._shard_of(frame_index)
             if shard is None:
-                return self.storage.read(path)
+                return self.storage.read_inside(path)
             file = shard.frames[frame_index].get(name)
             if file is None:
                 raise FileNotFoundError
@@ -107,7 +108,7 @@ class FrameStore:
         except FileNotFoundError as error:
             raise ValueError(f"{self.where(frame_index, name)}: is missing") from error
         except OSError as error:
-            raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error}") from error
+            raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error.strerror or error}") from error
 
     def path(self, frame_index: int, name: str) -> Path | None:
         """Path of a file of a frame, or None where it is remote or inside a tar file.
@@ -216,7 +217,8 @@ def read_pairs_per_tar(storage: Storage) -> int | None:
 def shard_numbers(storage: Storage) -> list[int]:
     """Numbers of the stored tar files, ascending."""
     names = storage.names(SHARDS_FOLDER)
-    return sorted(int(name[:-4]) for name in names if name.endswith(".tar") and name[:-4].isdecimal())
+    found = (frame_of_name(name[:-4]) for name in names if name.endswith(".tar"))
+    return sorted(number for number in found if number is not None)
 
 
 def read_shard_index(storage: Storage, number: int) -> ShardIndex:
@@ -258,11 +260,11 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
         with tarfile.open(fileobj=cast(IO[bytes], hashed), mode="r|", bufsize=_BLOCK_BYTES) as archive:
             for member in archive:
                 key, _, name = member.name.partition(".")
-                data = archive.extractfile(member)
-                if data is None or not key.isdecimal():
+                data, frame_index = archive.extractfile(member), frame_of_name(key)
+                if data is None or frame_index is None:
                     raise ValueError(f"holds {member.name}, which is not a file of a frame")
                 digest = sha256_of(data)
-                files = frames.setdefault(int(key), {})
+                files = frames.setdefault(frame_index, {})
                 files[name] = PackedFile(member.offset_data, member.size, digest)
     except tarfile.TarError as error:
         raise ValueError(f"is not a complete tar file: {error}") from error

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import struct
-import tempfile
 import zlib
-from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.types.images import Pixels
 from geometry.pinhole import PinholeCamera
 
 MOST_PIXELS = 150_000_000
 """Most pixels of an image whose size is not known from its rig: as many as the largest sensors and maps of 16k have."""
+# Small images may be of one value, which takes a thousandth of their size; no camera makes a large one.
+_FREE_BYTES, _MOST_EXPANSION = 2**28, 100
+# Samples of a pixel by the colour type in a PNG's header.
+_PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Noise has no repeats to search for: Huffman coding alone takes half the time of level 1 and a sixth less space. Part
@@ -86,6 +89,11 @@ def png_fault(data: bytes, camera: PinholeCamera) -> str | None:
     size_px = struct.unpack_from(">II", data, position + 8)
     if size_px != (camera.width_px, camera.height_px):
         return f"must be {camera.width_px} x {camera.height_px} px, got {size_px[0]} x {size_px[1]}"
+    try:
+        bits, color = data[position + 16 : position + 18]
+        check_image_size(*size_px, _PNG_SAMPLES.get(color, 4) * max(1, bits // 8), len(data))
+    except ValueError as error:
+        return str(error)
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 12 + length
@@ -105,6 +113,7 @@ _EXR_MAGIC = 20000630
 # Version 2 with none of the flags for tiles, deep pixels and several parts; long names alone are harmless.
 _EXR_PLAIN_VERSIONS = (2, 2 | 0x400)
 _EXR_MAX_HEADER_BYTES = 65536
+_EXR_LEAST_CHANNEL_BYTES, _EXR_SAMPLE_BYTES = 18, 4
 
 
 class EyePasses(Protocol):
@@ -144,8 +153,8 @@ def encode_passes(seen: EyePasses) -> bytes:
     # ZIP is what cv2, Mitsuba and Blender all read.
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     contiguous = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        path = Path(folder) / "passes.exr"
+    with scratch_folder() as folder:
+        path = folder / "passes.exr"
         OpenEXR.File(header, contiguous).write(str(path))
         return path.read_bytes()
 
@@ -162,7 +171,8 @@ def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDAr
         ValueError: not an EXR file, truncated, damaged, of another size, or without one of the channels.
     """
     size = (camera.width_px, camera.height_px)
-    window = _data_window(data)
+    header = _exr_header(data)
+    window = None if header is None else header.window
     if window != (0, 0, size[0] - 1, size[1] - 1):
         raise ValueError(f"{name}: must be an EXR file of one part and {size} px, got {window}")
     try:
@@ -179,38 +189,60 @@ def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
     """The planes of a single-part EXR file by channel, as stored.
 
     Raises:
-        ValueError: no readable header, more than `MOST_PIXELS`, or a message of the library on one line.
+        ValueError: no readable header, a size that `check_image_size` refuses, or a message of the library on one line.
     """
     import OpenEXR
 
-    window = _data_window(data)
-    if window is None:
+    header = _exr_header(data)
+    if header is None:
         raise ValueError("has no header of a plain EXR file of one part")
-    check_pixel_count(window[2] - window[0] + 1, window[3] - window[1] + 1)
+    left, top, right, bottom = header.window
+    check_image_size(right - left + 1, bottom - top + 1, _EXR_SAMPLE_BYTES * header.channel_count, len(data))
     try:
         # The library reads files only.
-        with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-            copy = Path(folder) / "image.exr"
+        with scratch_folder() as folder:
+            copy = folder / "image.exr"
             copy.write_bytes(data)
             with OpenEXR.File(str(copy), separate_channels=True) as file:
                 return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
-        message = " ".join(str(error).replace(folder, "").split()) or type(error).__name__
+        message = " ".join(str(error).replace(str(folder), "").split()) or type(error).__name__
         raise ValueError(message) from error
 
 
-def check_pixel_count(width_px: int, height_px: int) -> None:
+def check_image_size(width_px: int, height_px: int, bytes_per_px: float, file_bytes: int) -> None:
     """Refuse an image that would fill the memory, before anything decodes it.
 
+    Args:
+        width_px, height_px: size of the image.
+        bytes_per_px: of the decoded image.
+        file_bytes: size of the file.
+
     Raises:
-        ValueError: more than `MOST_PIXELS`, or a side of no pixels.
+        ValueError: more than `MOST_PIXELS`, a side of no pixels, or far more than so small a file can hold of a
+            camera's image.
     """
     if min(width_px, height_px) < 1 or width_px * height_px > MOST_PIXELS:
         raise ValueError(f"must have 1 to {MOST_PIXELS} pixels, got {width_px} x {height_px}")
+    decoded = round(width_px * height_px * bytes_per_px)
+    if decoded > max(_FREE_BYTES, _MOST_EXPANSION * file_bytes):
+        raise ValueError(f"must not expand more than {_MOST_EXPANSION} times, got {file_bytes} bytes of {decoded}")
 
 
-def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
-    """Lowest and highest x and y of a plain EXR file's pixels, or None without a readable header.
+class _ExrHeader(NamedTuple):
+    """What is known of an EXR file before it is decoded.
+
+    Attributes:
+        window: lowest x and y, highest x and y of the pixels.
+        channel_count: number of channels.
+    """
+
+    window: tuple[int, int, int, int]
+    channel_count: int
+
+
+def _exr_header(data: bytes) -> _ExrHeader | None:
+    """The header of a plain EXR file, or None without a readable one.
 
     Source: OpenEXR's description of its file layout: magic number, version, then attributes, each a name, a type, both
     ended by 0, a size and a value; an empty name ends the header.
@@ -220,8 +252,12 @@ def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
     ]:
         return None
     position = 8
+    window: tuple[int, int, int, int] | None = None
+    channel_count = 0
     while position < min(len(data), _EXR_MAX_HEADER_BYTES):
         name_end = data.find(b"\0", position)
+        if name_end == position:
+            break
         type_end = data.find(b"\0", name_end + 1)
         if name_end in (-1, position) or type_end == -1 or type_end + 5 > len(data):
             return None
@@ -231,6 +267,9 @@ def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
             return None
         if data[position:name_end] == b"dataWindow" and size == 16:
             left, top, right, bottom = struct.unpack_from("<iiii", data, value)
-            return left, top, right, bottom
+            window = left, top, right, bottom
+        elif data[position:name_end] == b"channels":
+            # Each is a name that ends by 0 and 16 bytes; names have at least one character, and one 0 ends the list.
+            channel_count = size // _EXR_LEAST_CHANNEL_BYTES
         position = value + size
-    return None
+    return None if window is None else _ExrHeader(window, channel_count)

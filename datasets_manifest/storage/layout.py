@@ -17,6 +17,8 @@ SHARDS_FILE = "shards/layout.json"
 ANNOTATIONS_FOLDER = "annotations"
 CALIBRATION_FOLDER = "calibration"
 
+_MOST_DIGITS = 12
+
 
 def frame_folder(dataset: Path, frame_index: int) -> Path:
     """Folder of one frame of a dataset on the local disk."""
@@ -28,13 +30,23 @@ def frame_name(frame_index: int) -> str:
     return f"{FRAMES_FOLDER}/{frame_index:06d}"
 
 
+def frame_of_name(name: str) -> int | None:
+    """Index of the frame, or number of the tar file, that has exactly this name; None for any other name."""
+    # Digits of other scripts are decimal too, and 7 is no other name of 000007.
+    if not (name.isascii() and name.isdecimal() and len(name) <= _MOST_DIGITS):
+        return None
+    return int(name) if f"{int(name):06d}" == name else None
+
+
 def frame_indices(dataset: Path) -> list[int]:
     """Indices of the frames with folders on the local disk, ascending; see `FrameStore` for tar files and URLs."""
     folder = dataset / FRAMES_FOLDER
     if not folder.is_dir():
         return []
     return sorted(
-        int(entry.name) for entry in folder.iterdir() if entry.name.isdecimal() and (entry / RECORD_FILE).is_file()
+        index
+        for entry in folder.iterdir()
+        if (index := frame_of_name(entry.name)) is not None and (entry / RECORD_FILE).is_file()
     )
 
 

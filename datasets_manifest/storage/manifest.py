@@ -18,6 +18,7 @@ from datasets_manifest.storage.storage import Location, map_in_order, open_stora
 from datasets_manifest.storage.writer import canonical_json
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
+from drogue_models.untrusted_files import parse_json
 
 SplitName = Literal["train", "val", "test"]
 
@@ -179,7 +180,7 @@ def read_manifest(dataset: Location) -> Manifest:
     if not storage.root_exists():
         raise ValueError(f"{dataset}: there is no such dataset folder")
     try:
-        table = json.loads(storage.read(MANIFEST_FILE))
+        table = parse_json(storage.read(MANIFEST_FILE))
     except FileNotFoundError as error:
         if storage.exists(BLIND_FILE):
             raise ValueError(
@@ -188,7 +189,7 @@ def read_manifest(dataset: Location) -> Manifest:
         raise ValueError(f"{path}: is missing; render the recipe again into this folder to complete it") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     try:
         return Manifest.model_validate(table)
@@ -217,7 +218,7 @@ def _read_entry(store: FrameStore, frame_index: int, split_of_scene: Mapping[int
     path = store.where(frame_index, RECORD_FILE)
     try:
         data = store.read(frame_index, RECORD_FILE)
-        table = json.loads(data)
+        table = parse_json(data)
         entry = FrameEntry(
             frame_index=table["frame_index"],
             scene_id=table["scene_id"],
@@ -226,7 +227,7 @@ def _read_entry(store: FrameStore, frame_index: int, split_of_scene: Mapping[int
             record_sha256=hashlib.sha256(data).hexdigest(),
         )
         engine = str(table["engine_version"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: is not a complete record; delete the frame's folder and render it again") from error
     if entry.frame_index != frame_index:
         raise ValueError(f"{path}: belongs to frame {entry.frame_index}")

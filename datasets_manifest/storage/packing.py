@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import tarfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -37,11 +36,13 @@ from datasets_manifest.storage.layout import (
     SHARDS_FILE,
     SHARDS_FOLDER,
     frame_name,
+    frame_of_name,
     is_plain_name,
     shard_file,
     shard_index_file,
 )
 from datasets_manifest.storage.storage import Location, Storage, map_in_order, open_storage
+from drogue_models.untrusted_files import parse_json
 
 Contents = list[tuple[str, bytes]]
 Packed = Mapping[str, PackedFile]
@@ -186,7 +187,7 @@ def repair_shards(dataset: Location) -> None:
 
 
 def _indices(names: list[str]) -> set[int]:
-    return {int(name) for name in names if name.isdecimal()}
+    return {index for index in map(frame_of_name, names) if index is not None}
 
 
 def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mapping[int, Packed]) -> None:
@@ -243,7 +244,7 @@ def _staged_files(storage: Storage, frame_index: int) -> Contents | None:
     folder = frame_name(frame_index)
     try:
         record = storage.read(f"{folder}/{RECORD_FILE}")
-        hashes: dict[str, str] = json.loads(record)["file_sha256"]
+        hashes: dict[str, str] = parse_json(record)["file_sha256"]
         files = {name: storage.read(f"{folder}/{name}") for name in hashes if is_plain_name(name)}
     except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
         return None

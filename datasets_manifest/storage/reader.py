@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import math
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -19,9 +19,10 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.field_types import write_rig
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import Pixels, StereoImages
-from datasets_manifest.types.records import PairRecord
+from datasets_manifest.types.records import MOST_TIME_S, PairRecord
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
+from drogue_models.untrusted_files import parse_json
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 
@@ -165,8 +166,8 @@ def read_record_table(frames: FrameStore, frame_index: int) -> dict[str, Any]:
 
 def _parse_table(data: bytes, path: str) -> dict[str, Any]:
     try:
-        table = json.loads(data)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        table = parse_json(data)
+    except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     if not isinstance(table, dict):
         raise ValueError(f"{path}: must hold a JSON object")
@@ -182,8 +183,11 @@ def read_shutter(frames: FrameStore, frame_index: int) -> Shutter:
     table = read_record_table(frames, frame_index)
     try:
         values = table["time_s"], table["frame"]["exposure"]["time_s"], table.get("image_black_level_dn", 0.0)
-        return Shutter(*(float(value) for value in values))
-    except (KeyError, TypeError, ValueError) as error:
+        shutter = Shutter(*(float(value) for value in values))
+        if not (all(map(math.isfinite, shutter)) and abs(shutter.time_s) < MOST_TIME_S):
+            raise ValueError("must be finite")
+        return shutter
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{frames.where(frame_index, RECORD_FILE)}: no valid time_s or exposure") from error
 
 

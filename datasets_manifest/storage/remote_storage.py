@@ -62,18 +62,13 @@ class RemoteStorage:
         with self._named_errors(name, "read"):
             return bytes(self._fs.cat_file(self._path(name), **part))
 
+    def read_inside(self, name: str) -> bytes:
+        """The object, as there are no links."""
+        return self.read(name)
+
     def open(self, name: str) -> AbstractContextManager[BinaryIO]:
         """A stream that fetches large blocks as they are read."""
         return io.BufferedReader(_ObjectStream(self, name), _BLOCK_BYTES)
-
-    @contextmanager
-    def local_copy(self, name: str) -> Iterator[Path]:
-        """A temporary copy for the duration of the block."""
-        with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-            path = Path(folder) / PurePosixPath(name).name
-            with self._named_errors(name, "read"):
-                self._fs.get_file(self._path(name), str(path))
-            yield path
 
     def names(self, folder: str) -> list[str]:
         """Names directly in a folder."""

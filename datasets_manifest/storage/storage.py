@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import BinaryIO, Protocol, TextIO, TypeVar, cast
 
@@ -21,6 +22,7 @@ from datasets_manifest.atomic import (
     write_bytes_atomic,
 )
 from datasets_manifest.storage.remote_storage import RemoteStorage
+from drogue_models.untrusted_files import MOST_BYTES, open_regular, read_regular
 
 Location = Path | str
 """A folder, or a URL such as `s3://bucket/name`; text without `://` is a folder too."""
@@ -36,7 +38,8 @@ _CONCURRENT_REQUESTS = 16
 class Storage(Protocol):
     """Files below one root, by names with `/` between folders.
 
-    Missing files raise `FileNotFoundError`, all other failures an `OSError` of one line.
+    Missing files raise `FileNotFoundError`, all other failures an `OSError` of one line. Of local files only regular
+    ones are read, and at most `MOST_BYTES` at a time.
 
     Attributes:
         is_remote: whether every access is a network request.
@@ -72,12 +75,12 @@ class Storage(Protocol):
         """Contents of a file, or up to `size` bytes of it from `offset` on."""
         ...
 
-    def open(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A seekable stream of a large file."""
+    def read_inside(self, name: str) -> bytes:
+        """Contents of a file, unless it is a link that leads out of its folder."""
         ...
 
-    def local_copy(self, name: str) -> AbstractContextManager[Path]:
-        """A read-only local file with the contents, for libraries that open files themselves."""
+    def open(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A seekable stream of a large file."""
         ...
 
     def names(self, folder: str) -> list[str]:
@@ -222,20 +225,23 @@ class LocalStorage:
 
     def read(self, name: str, offset: int = 0, size: int | None = None) -> bytes:
         """A file or a part of it."""
+        path = self._root / name
         if offset == 0 and size is None:
-            return (self._root / name).read_bytes()
-        with (self._root / name).open("rb") as stream:
+            return read_regular(path)
+        with open_regular(path) as stream:
             stream.seek(offset)
-            return stream.read(size)
+            data = stream.read(MOST_BYTES + 1 if size is None else min(size, MOST_BYTES + 1))
+        if len(data) > MOST_BYTES:
+            raise OSError(errno.EFBIG, f"is to be read by more than {MOST_BYTES} bytes at once", str(path))
+        return data
+
+    def read_inside(self, name: str) -> bytes:
+        """A file that is no link out of its folder, at the time when it is opened."""
+        return read_regular(self._root / name, in_folder=True)
 
     def open(self, name: str) -> AbstractContextManager[BinaryIO]:
         """The file itself."""
-        return (self._root / name).open("rb")
-
-    @contextmanager
-    def local_copy(self, name: str) -> Iterator[Path]:
-        """The file itself."""
-        yield self._root / name
+        return open_regular(self._root / name)
 
     def names(self, folder: str) -> list[str]:
         """Names directly in a folder."""

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from drogue_models.frozen_model import FrozenModel, ReflectanceRgb
+from drogue_models.untrusted_files import read_regular
 
 CloudKind = Literal["cumulus", "stratus", "cirrus"]
 
@@ -221,7 +222,7 @@ def _sha256(file: Path) -> str:
 
 def _read(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return read_regular(file)
     except OSError as error:
         raise ValueError(
             f"environment.map: {file} cannot be read: {error.strerror}; a frame from a dataset looks for its map in "

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from datasets_manifest.atomic import open_text_atomic
 from datasets_manifest.types.field_types import Matrix6, Transform
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.untrusted_files import open_regular, parse_json
 from geometry.stereo import Eye
+
+_MOST_LINE_BYTES = 2**24
 
 TANGENT = "left: t' = t + dt, R' = exp([w]x) R; order dt [m], w [rad]"
 
@@ -185,17 +187,21 @@ def read_estimates(path: Path) -> Iterator[Estimate]:
     """Estimates from a JSON-lines file, by droguekit or by any other program.
 
     Raises:
-        ValueError: the file cannot be read, or a line is not an estimate; names file and line.
+        ValueError: the file cannot be read, or a line is not an estimate or too long; names file and line.
     """
     try:
-        with path.open(encoding="utf-8") as stream:
-            for number, line in enumerate(stream, start=1):
+        with open_regular(path) as stream:
+            number = 0
+            while line := stream.readline(_MOST_LINE_BYTES + 1):
+                number += 1
+                if len(line) > _MOST_LINE_BYTES:
+                    raise ValueError(f"{path}, line {number}: has more than {_MOST_LINE_BYTES} bytes")
                 if not line.strip():
                     continue
                 try:
-                    yield _ADAPTER.validate_python(json.loads(line))
-                except (ValidationError, ValueError, RecursionError) as error:
+                    yield _ADAPTER.validate_python(parse_json(line))
+                except ValueError as error:
                     first = str(error).splitlines()[0]
                     raise ValueError(f"{path}, line {number}: not a pose estimate: {first}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

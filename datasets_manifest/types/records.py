@@ -9,7 +9,10 @@ from pydantic import Field
 from datasets_manifest.types.field_types import Transform
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.parts import MAX_MARKERS
 
+MOST_TIME_S = 2.0**31
+"""Times of records stay below it, as the stamps of robots and of exports have seconds of 32 bits. [s]"""
 PixelPoint = tuple[float, float]
 PixelBox = tuple[float, float, float, float]
 """x, y of the low corner, width, height, in pixel-centre coordinates: a full frame is (-0.5, -0.5, W, H)."""
@@ -66,7 +69,7 @@ class ViewRecord(FrozenModel):
         board_corners_px: images of a calibration board's inner corners, row by row; only in frames with a board.
     """
 
-    markers: tuple[FeatureView, ...]
+    markers: tuple[FeatureView, ...] = Field(max_length=MAX_MARKERS)
     hub: HubView | None
     box_full_xywh_px: PixelBox | None
     box_visible_xywh_px: PixelBox | None
@@ -129,7 +132,7 @@ class PairRecord(FrozenModel):
     frame_index: int = Field(ge=0)
     scene_id: int = Field(ge=0)
     sequence_id: int | None
-    time_s: float
+    time_s: float = Field(gt=-MOST_TIME_S, lt=MOST_TIME_S)
     left_from_drogue: Transform | None
     left_from_drogue_open: Transform | None
     left_from_drogue_close: Transform | None

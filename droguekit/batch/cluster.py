@@ -6,13 +6,14 @@ import logging
 import math
 import pickle
 import signal
+import threading
 import time
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from datasets_manifest.storage.layout import EVENTS_FILE
@@ -33,6 +34,8 @@ ALLOWED_FAILURES = 9
 # Enough that no worker waits for the client, and few enough that the scheduler's memory is independent of the recipe.
 _FRAMES_PER_WORKER = 2
 _CONNECT_S = 30
+# What stands in the queue of ended frames for a request to stop.
+_STOP = -1
 # Least time between two questions for the number of workers: the scheduler's answer is slower than a frame's report.
 _WORKERS_EVERY_S = 1.0
 
@@ -150,11 +153,12 @@ def run_on_cluster(
         partial(_engine_version, task.recipe.render.engine, task.device)
     )
     shared = replace(task, dataset=absolute(task.dataset), engine_version=version)
-    client = _connect(address)
+    client = _connect(address, stop)
+    if client is None:
+        return
     try:
-        yield from _SubmissionWindow(client, ClusterTask(shared, current_build(), timeout_s), deque(indices)).attempts(
-            stop
-        )
+        window = _SubmissionWindow(client, ClusterTask(shared, current_build(), timeout_s), deque(indices), stop.say)
+        yield from window.attempts(stop)
     finally:
         client.close()
 
@@ -162,27 +166,31 @@ def run_on_cluster(
 class _SubmissionWindow:
     """Waiting frames, and the few frames that the scheduler holds."""
 
-    def __init__(self, client: Client, task: ClusterTask, waiting: deque[int]) -> None:
-        self._client, self._task, self._waiting = client, pickle.dumps(task), waiting
+    def __init__(self, client: Client, task: ClusterTask, waiting: deque[int], say: Callable[[str], None]) -> None:
+        self._client, self._task, self._waiting, self._say = client, pickle.dumps(task), waiting, say
         self._running: dict[int, Future] = {}
         # Frames that Dask gave up: one of them killed workers, the others may only have waited on the same workers.
         self._suspects: deque[int] = deque()
         self._alone = False
         # Futures end in a thread of Dask, and stop requests come from a signal handler: both only put into the queue.
-        self._ended: SimpleQueue[int | None] = SimpleQueue()
+        self._ended: SimpleQueue[int] = SimpleQueue()
         self._threads: dict[str, int] = {}
+        self._is_told = False
         self._asked_s = -math.inf
         self._resident_gib: dict[str, float] = {}
 
     def attempts(self, stop: StopRequest) -> Generator[TaskAttempt[FrameReport], None, None]:
         """Report each frame as it ends; frames are cancelled when the caller stops iterating."""
-        stop.wake = lambda: self._ended.put(None)
+        stop.wake = lambda: self._ended.put(_STOP)
         self._allow_failures(ALLOWED_FAILURES)
         try:
             while self._fill(stop.is_requested):
-                index = self._ended.get()
-                if index is None:
-                    stop.acknowledge(len(self._running))
+                index = self._next_ended()
+                if index is None or index == _STOP:
+                    if stop.is_requested and not self._has_workers():
+                        return  # nobody makes the frames that are submitted
+                    if index == _STOP:
+                        stop.acknowledge(len(self._running))
                     continue
                 future = self._running.pop(index)
                 yield self._attempt(index, future)
@@ -206,6 +214,21 @@ class _SubmissionWindow:
             self._submit(self._suspects.popleft())
         return bool(self._running)
 
+    def _next_ended(self) -> int | None:
+        """The frame that ended, `_STOP`, or None after a while in which neither came."""
+        try:
+            return self._ended.get(timeout=_WORKERS_EVERY_S)
+        except Empty:
+            if not self._has_workers() and not self._is_told:
+                self._say("the Dask scheduler has no workers; waiting for some to join")
+                self._is_told = True
+            return None
+
+    def _has_workers(self) -> bool:
+        self._ask_for_workers()
+        self._is_told = self._is_told and not self._threads
+        return bool(self._threads)
+
     def _submit(self, index: int) -> None:
         future = self._client.submit(make_on_worker, self._task, index, pure=False)
         self._running[index] = future
@@ -214,10 +237,13 @@ class _SubmissionWindow:
     def _put(self, index: int, _: Any) -> None:
         self._ended.put(index)
 
-    def _size(self) -> int:
+    def _ask_for_workers(self) -> None:
         if time.monotonic() - self._asked_s > _WORKERS_EVERY_S:
             self._asked_s, self._threads = time.monotonic(), self._client.nthreads()
             self._resident_gib = {name: gib for name, gib in self._resident_gib.items() if name in self._threads}
+
+    def _size(self) -> int:
+        self._ask_for_workers()
         return _FRAMES_PER_WORKER * max(1, sum(self._threads.values()))
 
     def _allow_failures(self, count: int) -> None:
@@ -250,7 +276,13 @@ class _SubmissionWindow:
         return TaskAttempt(index, 1 + self._alone, value, error, final, sum(self._resident_gib.values()))
 
 
-def _connect(address: str) -> Client:
+def _connect(address: str, stop: StopRequest) -> Client | None:
+    """A client of the scheduler, or None where a stop is requested meanwhile.
+
+    Raises:
+        ValueError: `distributed` is missing.
+        OSError: no scheduler answers.
+    """
     try:
         import dask
         from distributed import Client
@@ -258,12 +290,26 @@ def _connect(address: str) -> Client:
         raise ValueError("--scheduler: Dask is missing: pip install 'droguekit[cluster]'") from error
     for name in ("distributed", "distributed.client"):  # Dask sets the level of the second separately
         logging.getLogger(name).setLevel(logging.CRITICAL)  # failures are reported by frame
+    answers: SimpleQueue[Client | Exception | None] = SimpleQueue()
+
+    def connect() -> None:
+        try:
+            # Every message to the scheduler names the task, and by default a client remembers the last thousand.
+            with dask.config.set({"distributed.admin.low-level-log-length": 10}):
+                answers.put(Client(address, timeout=_CONNECT_S, set_as_default=False))
+        except Exception as error:
+            answers.put(error)
+
+    # Dask waits without a limit for the first words of whatever listens at the address.
+    threading.Thread(target=connect, daemon=True).start()
+    stop.wake = lambda: answers.put(None)
     try:
-        # Every message to the scheduler names the task, and by default a client remembers the last thousand.
-        with dask.config.set({"distributed.admin.low-level-log-length": 10}):
-            return Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise OSError(f"--scheduler: no Dask scheduler answers at {address}: {error}") from error
+        answer = None if stop.is_requested else answers.get(timeout=_CONNECT_S)
+    except Empty:
+        answer = OSError(f"what listens there said nothing for {_CONNECT_S} s")
+    if isinstance(answer, Exception):
+        raise OSError(f"--scheduler: no Dask scheduler answers at {address}: {answer}") from answer
+    return answer
 
 
 def _engine_version(name: str, device: Device) -> str:

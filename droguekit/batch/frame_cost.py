@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 
+from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import Drop
@@ -124,8 +124,8 @@ def probe(recipe: Recipe, frames: ProbeFrames, device: Device = "cpu") -> ProbeR
 
 def _probe(recipe: Recipe, frames: ProbeFrames, device: Device) -> ProbeResult:
     drops = list[Drop]()
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        task = FrameTask(recipe, Path(folder), device=device)
+    with scratch_folder() as folder:
+        task = FrameTask(recipe, folder, device=device)
         warm_up, failed_s = make_in_turn(task, frames.warm_up, drops, False)
         counted, more_failed_s = make_in_turn(task, frames.counted, drops, bool(warm_up))
         if not counted:
@@ -363,8 +363,8 @@ def measure_frames(recipe: Recipe, frames: tuple[int, ...], device: Device = "cp
 
 
 def _measure(recipe: Recipe, frames: tuple[int, ...], device: Device) -> tuple[MeasuredFrame, ...]:
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        task = FrameTask(recipe, Path(folder), device=device)
+    with scratch_folder() as folder:
+        task = FrameTask(recipe, folder, device=device)
         task(frames[0])
         return tuple(_measure_frame(task, frame_index) for frame_index in frames)
 
@@ -387,9 +387,9 @@ def frames_per_second(recipe: Recipe, workers: int, device: Device = "cpu") -> f
     if recipe.frames.count <= uncounted:
         raise ValueError(f"frames: {recipe.frames.count} are too few for {workers} workers; {uncounted} do not count")
     ended_s = []
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+    with scratch_folder() as folder:
         frames = range(recipe.frames.count)
-        with closing(run_tasks(FrameTask(recipe, Path(folder), device=device), frames, workers)) as attempts:
+        with closing(run_tasks(FrameTask(recipe, folder, device=device), frames, workers)) as attempts:
             for attempt in attempts:
                 if attempt.final and attempt.error is not None:
                     raise attempt.error

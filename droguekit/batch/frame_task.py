@@ -15,11 +15,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 
+from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_passes
 from datasets_manifest.storage.layout import RECORD_FILE, frame_folder, passes_file
@@ -30,6 +30,7 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import encode_files, write_frame
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
+from drogue_models.untrusted_files import parse_json
 from droguekit.batch.worker_pool import run_in_own_process
 from geometry.stereo import EYES, Eye
 from labelgen.frame_labels import label_frame
@@ -266,7 +267,7 @@ def reproduce_frame(dataset: Location, frame_index: int, device: Device = "cpu")
     faults = source.verify(frame_index)
     if faults:
         return Reproduction("different", tuple(faults), ())
-    old = json.loads(source.frames.read(frame_index, RECORD_FILE))
+    old = parse_json(source.frames.read(frame_index, RECORD_FILE))
     new, record_sha256 = run_in_own_process(partial(_make_again, source.manifest.recipe, frame_index, device))
     expected = next(entry.record_sha256 for entry in source.manifest.frames if entry.frame_index == frame_index)
     # The record holds the hashes of all other files.
@@ -281,9 +282,9 @@ def reproduce_frame(dataset: Location, frame_index: int, device: Device = "cpu")
 
 def _make_again(recipe: Recipe, frame_index: int, device: Device) -> tuple[dict[str, Any], str]:
     """Make the frame in a new folder: its record, and the hash of the record's file."""
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        FrameTask(recipe, Path(folder), device=device)(frame_index)
-        data = (frame_folder(Path(folder), frame_index) / RECORD_FILE).read_bytes()
+    with scratch_folder() as folder:
+        FrameTask(recipe, folder, device=device)(frame_index)
+        data = (frame_folder(folder, frame_index) / RECORD_FILE).read_bytes()
     return json.loads(data), hashlib.sha256(data).hexdigest()
 
 

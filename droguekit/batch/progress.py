@@ -11,6 +11,8 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
+from droguekit.output_streams import printable, terminal_stream
+
 # Shortest time between two lines of a log, which always gets one at the end.
 _LINE_EVERY_S = 10.0
 
@@ -69,7 +71,7 @@ class PlainProgress:
 
     def say(self, text: str) -> None:
         """Print the line."""
-        print(text, file=self._stream, flush=True)
+        print(printable(text), file=self._stream, flush=True)
 
     def end(self) -> None:
         """Nothing to clear."""
@@ -121,11 +123,11 @@ class TerminalProgress:
     def note(self, text: str) -> None:
         """Show it below the bar."""
         if self._progress is not None:
-            self._progress.note = text
+            self._progress.note = printable(text)
 
     def say(self, text: str) -> None:
         """Print the line above the bar."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def end(self) -> None:
         """Remove the bar."""
@@ -161,7 +163,7 @@ class ProgressRate:
 def progress_report() -> ProgressReport:
     """A bar if standard error is a terminal, else lines."""
     if sys.stderr.isatty():
-        return TerminalProgress(Console(stderr=True))
+        return TerminalProgress(Console(file=terminal_stream()))
     return PlainProgress(sys.stderr)
 
 

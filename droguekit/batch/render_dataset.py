@@ -8,17 +8,17 @@ from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.release.card import write_card
 from datasets_manifest.release.croissant import write_croissant
 from datasets_manifest.storage.frame_store import list_frames
-from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECIPE_FILE
 from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, read_manifest, with_build, write_manifest
 from datasets_manifest.storage.packing import read_packing
-from datasets_manifest.storage.storage import Location, join
+from datasets_manifest.storage.storage import Location, join, open_storage
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
 from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
 from droguekit.batch.failure_policy import FATAL_ERRORS, FIRST_FRAMES, error_reason
@@ -27,14 +27,15 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
 from droguekit.batch.resume import check_frames, finish_frames, open_dataset
 from droguekit.batch.stop_request import StopRequest
-from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerLimits, is_accident, run_tasks
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerDiedError, WorkerLimits, is_accident, run_tasks
 from labelgen.export.annotations.coco import write_annotations
-from render.engine import engine_notice
+from render.engine import crash_advice, engine_notice
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
 # With so many pairs, a step of milliseconds a pair takes long enough to be announced.
 _MANY_PAIRS = 1000
+_VANISHED = "it was there, and somebody deleted it during the run; run the same command to make it again"
 
 
 @dataclass
@@ -65,6 +66,20 @@ class RunTotals:
         """The numbers for the last event of a run."""
         numbers = {"retries": self.retries, "size_bytes": self.size_bytes, "workers_peak_gib": round(self.peak_gib, 3)}
         return {"made": len(self.made), **numbers, "stage_s": dict(self.stage_s)}
+
+
+class RunSize(NamedTuple):
+    """How much a run has to do, and who does it.
+
+    Attributes:
+        planned: frames to make.
+        workers: processes that make them.
+        crash_advice: what to do where native code ends workers.
+    """
+
+    planned: int
+    workers: int
+    crash_advice: str
 
 
 class EventLog:
@@ -100,11 +115,12 @@ def make_frames(
     totals, drops = RunTotals(), list[Drop]()
     if not todo:
         return totals, drops
+    run = RunSize(len(todo), options.worker_count(), crash_advice(task.recipe.render.engine))
     report.begin("pairs", len(todo))
     try:
         with StopRequest(report.say) as stop, closing(_attempts(task, todo, options, stop)) as attempts:
             for attempt in attempts:
-                _record_attempt(attempt, totals, drops, len(todo), report, events)
+                _record_attempt(attempt, totals, drops, run, report, events)
     finally:
         report.end()
     if stop.is_requested:
@@ -118,18 +134,22 @@ def _record_attempt(
     attempt: TaskAttempt[FrameReport],
     totals: RunTotals,
     drops: list[Drop],
-    planned: int,
+    run: RunSize,
     report: ProgressReport,
     events: EventLog,
 ) -> None:
-    """Count, log and report an attempt."""
+    """Count, log and report an attempt.
+
+    Raises:
+        BaseException: the error of the attempt, where other frames would meet it too.
+    """
     totals.peak_gib = max(totals.peak_gib, attempt.workers_gib)
     if attempt.value is not None:
         totals.add(attempt.index, attempt.value)
         cost = {**asdict(attempt.value), "workers_gib": round(attempt.workers_gib, 3)}
         events.write("frame", frame=attempt.index, attempt=attempt.number, **cost)
     else:
-        reason = _failure_reason(attempt, len(totals.made), len(drops), planned)
+        reason = _failure_reason(attempt, totals, len(drops), run)
         events.write("drop" if attempt.final else "retry", frame=attempt.index, reason=reason)
         report.say(f"frame {attempt.index}: {reason}{'' if attempt.final else '; it is tried again'}")
         totals.retries += not attempt.final
@@ -162,7 +182,7 @@ def _attempts(
     return run_tasks(task, todo, workers, limits, stop, task.pack)
 
 
-def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, planned: int) -> str:
+def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, dropped: int, run: RunSize) -> str:
     """Why an attempt failed.
 
     Raises:
@@ -171,10 +191,15 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, 
     error = attempt.error
     if error is None:
         raise ValueError(f"frame {attempt.index}: its task returned nothing")
+    advice = run.crash_advice if isinstance(error, WorkerDiedError) and error.is_of_native_code else ""
     if is_accident(error):
-        return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}"
+        # Every worker has had a second one by then, so that none was only unlucky.
+        accidents = totals.retries + dropped + 1
+        if not totals.made and accidents >= max(MAX_ATTEMPTS * FIRST_FRAMES, 2 * run.workers):
+            raise OSError(f"no frame can be made: {accidents} attempts failed, the last: {error}{advice}") from error
+        return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}{advice}"
     if not isinstance(error, LostWorkersError):
-        is_common = made == 0 and dropped + 1 >= min(FIRST_FRAMES, planned)
+        is_common = not totals.made and dropped + 1 >= min(FIRST_FRAMES, run.planned)
         if is_common or isinstance(error, FATAL_ERRORS):
             raise error
     return error_reason(error)
@@ -249,6 +274,11 @@ def render_dataset(
         task = FrameTask(recipe, out, there.engine_version, packing, options.device)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
         totals, dropped = make_frames(task, todo, options, report, events)
+        # Somebody else may have deleted frames, or the whole folder, meanwhile.
+        if not open_storage(out).exists(RECIPE_FILE):
+            open_storage(out).write(RECIPE_FILE, source.text.encode())
+        vanished = sorted({*there.whole, *totals.made} - {*list_frames(out)})
+        dropped += [Drop(frame_index=index, reason=_VANISHED) for index in vanished]
         drops = still_missing([*manifest.drops, *dropped], out)
         if kept + len(totals.made) >= _MANY_PAIRS:
             report.say(f"writing manifest and annotations of {kept + len(totals.made)} pairs")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from datasets_manifest.storage.packing import check_pairs_per_tar, configure_pac
 from datasets_manifest.storage.storage import Location, map_in_order, open_storage
 from datasets_manifest.storage.writer import remove_leftovers
 from datasets_manifest.types.records import PairRecord
+from drogue_models.untrusted_files import parse_json
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
@@ -215,11 +215,11 @@ def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) 
         data = store.read(frame_index, layout.RECORD_FILE)
         if record_sha256 not in (None, hashlib.sha256(data).hexdigest()):
             return None
-        record = PairRecord.model_validate(json.loads(data))
+        record = PairRecord.model_validate(parse_json(data))
         for name, sha256 in record.file_sha256.items():
             if hashlib.sha256(store.read(frame_index, name)).hexdigest() != sha256:
                 return None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         cause = error.__cause__
         if store.storage.is_remote and isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
             raise cause from None

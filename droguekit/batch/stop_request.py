@@ -20,6 +20,7 @@ class StopRequest:
 
     Attributes:
         is_requested: whether the first signal has come.
+        say: prints a line for the user.
         wake: called then, in the signal handler, for code that does not wait for the descriptor.
     """
 
@@ -27,7 +28,7 @@ class StopRequest:
         """Take the function that prints a line for the user."""
         self.is_requested = False
         self.wake: Callable[[], object] | None = None
-        self._say = say
+        self.say = say
         self._before: dict[signal.Signals, Any] = {}
         self._reader = self._writer = -1
 
@@ -51,7 +52,7 @@ class StopRequest:
 
     def acknowledge(self, in_hand: int) -> None:
         """Tell the user what happens next."""
-        self._say(
+        self.say(
             f"stopping after the running frames ({in_hand}); press Ctrl-C again to stop at once and lose only those"
         )
 

@@ -17,6 +17,7 @@ from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar, cast
 
+from datasets_manifest.atomic import remove_scratch_folders
 from droguekit.batch.execution import resident_gib
 from droguekit.batch.stop_request import StopRequest
 from droguekit.numerical_threads import one_thread_in_new_processes
@@ -28,6 +29,9 @@ T = TypeVar("T")
 MAX_ATTEMPTS = 3
 
 
+_NATIVE_FAULTS = (signal.SIGILL, signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE)
+
+
 class WorkerDiedError(OSError):
     """The process of a task ended before the task did."""
 
@@ -35,6 +39,11 @@ class WorkerDiedError(OSError):
         """Take the exit code of `multiprocessing`, which is negative for a signal."""
         super().__init__(f"its worker process died ({_exit_text(exit_code)})")
         self.exit_code = exit_code
+
+    @property
+    def is_of_native_code(self) -> bool:
+        """Whether the process ended by a signal for wrong instructions, memory accesses or assertions."""
+        return self.exit_code is not None and -self.exit_code in _NATIVE_FAULTS
 
 
 class TaskTimeoutError(OSError):
@@ -103,6 +112,7 @@ class Worker:
             self._process.kill()  # it has no process group yet, or has ended
         self._process.join()
         self.connection.close()
+        remove_scratch_folders(self._process.pid or 0)
 
     def shut_down(self) -> None:
         """Let it end; it has no task."""

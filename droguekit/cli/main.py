@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import keyword
 import logging
-import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.core import TyperGroup
+
+from droguekit.output_streams import guard_standard_streams, printable
 
 DONE, FAULT, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -175,19 +175,20 @@ def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit
     except Exception as error:
         if debug:
             raise
-        print(f"{name}: error: {explain(error)}", file=sys.stderr)
+        print(f"{name}: error: {printable(explain(error))}", file=sys.stderr)
         return WRONG_INPUT
     return DONE
 
 
 def main() -> None:
     """Entry point of the installed command."""
+    guard_standard_streams()
     code = run(sys.argv[1:])
-    with contextlib.suppress(BrokenPipeError):
+    try:
         sys.stdout.flush()
-        sys.exit(code)
-    # The reader of our output has closed it; otherwise Python would report an error at exit.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"droguekit: error: {explain(error)}", file=sys.stderr)
+        code = WRONG_INPUT
     sys.exit(code)
 
 

@@ -21,6 +21,7 @@ from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estim
 from datasets_manifest.types.records import PixelBox
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
+from drogue_models.untrusted_files import parse_json
 from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.scoring.report.html_page import RowGroup, Table, page_template
 from droguekit.scoring.report.label_drawing import Tile, display_picture, evenly_spaced, label_picture, tile_of
@@ -181,13 +182,13 @@ def _read_boxes(dataset: Location) -> dict[int, PixelBox]:
     if not storage.exists(name):
         return {}
     try:
-        table = json.loads(storage.read(name))
+        table = parse_json(storage.read(name))
         boxes = {}
         for annotation in table["annotations"]:
             x, y, width, height = (float(number) for number in annotation["bbox"])
             # COCO counts from the image's corner.
             boxes[int(annotation["image_id"])] = (x - 0.5, y - 0.5, width, height)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{storage.where(name)}: holds no COCO boxes that can be read: {error}") from error
     return boxes
 

@@ -108,7 +108,7 @@ def engine_lines() -> Generator[str, None, bool]:
     Returns:
         Whether Mitsuba works; the analytic engine needs nothing.
     """
-    from render.mitsuba_engine.variant import probe_variant
+    from render.mitsuba_engine.variant import kernel_cache, probe_variant, verdicts_file
 
     yield "engine     analytic works: flat discs without path tracing, for estimators"
     yield from _blender_lines()
@@ -124,6 +124,7 @@ def engine_lines() -> Generator[str, None, bool]:
         yield "engine     mitsuba does not work without libatomic.so.1"
         return False
     yield f"engine     mitsuba works as {variant.variant}: {variant.reason}"
+    yield f"cache      {verdicts_file()} remembers which LLVM works, {kernel_cache()} holds compiled kernels"
     try:
         yield f"gpu        works, for --device cuda: {probe_variant('cuda').gpu}"
     except ValueError as error:

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING
 
 from droguekit.batch.progress import duration, human_size
 
+MOST_TIMEOUT_S = 1e6
+"""Longest time for a frame, some twelve days; what waits for a process takes no longer ones."""
+
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import RecipeSource
     from datasets_manifest.storage.storage import Location
@@ -65,8 +68,8 @@ def render_frames(
 
     if options.workers is not None and options.workers < 0:
         raise ValueError(f"workers: must not be negative, got {options.workers}")
-    if options.timeout_s is not None and not options.timeout_s > 0:
-        raise ValueError(f"--timeout: must be above 0 s, got {options.timeout_s:g}")
+    if options.timeout_s is not None and not 0 < options.timeout_s <= MOST_TIMEOUT_S:
+        raise ValueError(f"--timeout: must be above 0 s and at most {MOST_TIMEOUT_S:g} s, got {options.timeout_s:g}")
     if options.scheduler is not None and options.workers is not None:
         raise ValueError("--workers: are processes of this machine; omit it with --scheduler")
     if str(out).startswith("memory:") and options.worker_count() != 0:

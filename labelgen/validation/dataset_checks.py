@@ -84,6 +84,15 @@ class ValidationReport(FrozenModel):
         """Whether there are no faults."""
         return not self.faults
 
+    def fault_lines(self, most: int = 100) -> list[str]:
+        """Up to `most` faults of each check, a line each, and how many more it has."""
+        lines: list[str] = []
+        for check in self.checks:
+            lines += check.faults[:most]
+            if len(check.faults) > most:
+                lines.append(f"{check.name}: {len(check.faults) - most} more faults")
+        return lines
+
     def table(self) -> str:
         """The checks with their counts, a line each."""
         rows = [f"{check.name:<34}{check.count:>9}{len(check.faults):>9}" for check in self.checks]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 from collections import defaultdict
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+import pycocotools.mask
 from numpy.typing import NDArray
 from pycocotools.coco import COCO
 
@@ -23,6 +22,7 @@ from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part, drogue_part_ids
+from drogue_models.untrusted_files import parse_json
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.coco import DROGUE, coco_image_id, coco_neighbours
 from labelgen.export.keypoints import keypoint_count, view_of
@@ -58,8 +58,8 @@ def bag_faults(dataset: Dataset, names: list[str]) -> list[str]:
     faults, pairs = [], 0
     for name, path in paths.items():
         try:
-            with storage.local_copy(name) as file:
-                stamps, infos = _contents(file)
+            with storage.open(name) as stream:
+                stamps, infos = _contents(stream)
         # Any error that the library raises on a damaged bag.
         except Exception as error:
             faults.append(f"{path}: is damaged: {' '.join(str(error).split()) or type(error).__name__}")
@@ -77,20 +77,18 @@ def bag_faults(dataset: Dataset, names: list[str]) -> list[str]:
     return faults
 
 
-def _contents(path: Path) -> tuple[dict[str, list[int]], dict[str, Any]]:
+def _contents(stream: BinaryIO) -> tuple[dict[str, list[int]], dict[str, Any]]:
     """Times of all messages by topic [ns], and the first CameraInfo of each topic."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     infos: dict[str, Any] = {}
-    with path.open("rb") as stream:
-        for _, channel, raw, message in make_reader(
-            stream, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages():
-            stamps[channel.topic].append(raw.log_time)
-            if channel.topic.endswith("/camera_info"):
-                infos.setdefault(channel.topic, message)
+    reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+    for _, channel, raw, message in reader.iter_decoded_messages():
+        stamps[channel.topic].append(raw.log_time)
+        if channel.topic.endswith("/camera_info"):
+            infos.setdefault(channel.topic, message)
     return stamps, infos
 
 
@@ -155,8 +153,7 @@ class CocoFiles:
             return [f"{where}: the annotations of drogues beside the sought one differ from the record and part ids"]
         for index, other in enumerate(record.frame.neighbours):
             mask = drogue_mask(part_id, other.drogue.marker_count, index + 1)
-            masks = [self._all.annToMask(entry).astype(bool) for entry in others]
-            if mask.any() and not any(np.array_equal(mask, found) for found in masks):
+            if mask.any() and not any(_is_mask(entry.get("segmentation"), mask) for entry in others):
                 return [f"{where}: no segmentation is that of neighbours[{index}] in the part ids"]
         annotations = [entry for entry in annotations if entry not in others]
         if view.box_visible_xywh_px is None:
@@ -166,10 +163,9 @@ class CocoFiles:
         annotation = annotations[0]
         try:
             faults = _annotation_faults(annotation, record, eye)
-            mask = self._all.annToMask(annotation).astype(bool)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             return [f"{where}: annotation is invalid: {type(error).__name__} {error}"]
-        if not np.array_equal(mask, np.isin(part_id, drogue_part_ids(len(view.markers)))):
+        if not _is_mask(annotation.get("segmentation"), np.isin(part_id, drogue_part_ids(len(view.markers)))):
             faults.append("segmentation: differs from the part ids")
         return [f"{where}: {fault}" for fault in faults]
 
@@ -177,21 +173,25 @@ class CocoFiles:
         inside = f"{ANNOTATIONS_FOLDER}/{name}.json"
         path = self._storage.where(inside)
         try:
-            with self._storage.local_copy(inside) as file:
-                json.loads(file.read_bytes())
-                # pycocotools reports its progress on standard output.
-                with contextlib.redirect_stdout(io.StringIO()):
-                    coco = COCO(str(file))
-                # pycocotools takes a file without annotations for one of images alone.
-                annotation_count = len(coco.dataset["annotations"])
+            coco = COCO()
+            coco.dataset = parse_json(self._storage.read(inside))
+            # pycocotools reports its progress on standard output.
+            with contextlib.redirect_stdout(io.StringIO()):
+                coco.createIndex()
+            # pycocotools takes a file without annotations for one of images alone.
+            annotation_count = len(coco.dataset["annotations"])
+            categories = [(entry["id"], entry["name"]) for entry in coco.dataset["categories"]]
         except FileNotFoundError:
             self._faults.append(f"{path}: is missing")
             return None
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, AssertionError) as error:
-            self._faults.append(f"{path}: is truncated or not a COCO file: {error}")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
+            self._faults.append(f"{path}: is truncated or not a COCO file: {reason}")
             return None
         if set(coco.imgs) != ids:
             self._faults.append(f"{path}: has {len(coco.imgs)} images, its pairs have {len(ids)}")
+        if categories.count((DROGUE, "drogue")) != 1:
+            self._faults.append(f"{path}: categories: must have the drogue once, with the id {DROGUE}")
         if 0 in coco.anns or len(coco.anns) != annotation_count:
             self._faults.append(f"{path}: annotation ids must be unique and above 0")
         return coco
@@ -206,6 +206,21 @@ class CocoFiles:
         if not same:
             path = self._storage.where(f"{ANNOTATIONS_FOLDER}/{split}.json")
             self._faults.append(f"{path}: differs from all.json")
+
+
+def _is_mask(segmentation: Any, mask: NDArray[np.bool_]) -> bool:
+    """Whether a run-length encoding is that of an (H, W) mask.
+
+    It is compared encoded: decoders trust the sizes and runs in a file, and may write beyond their memory.
+    """
+    if not isinstance(segmentation, dict) or segmentation.get("size") != list(mask.shape):
+        return False
+    runs = segmentation.get("counts")
+    if isinstance(runs, list):
+        if not all(type(run) is int and 0 <= run <= mask.size for run in runs) or sum(runs) != mask.size:
+            return False
+        runs = pycocotools.mask.frPyObjects(segmentation, *mask.shape)["counts"].decode("ascii")
+    return bool(runs == pycocotools.mask.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"].decode("ascii"))
 
 
 def _annotation_faults(annotation: dict[str, Any], record: PairRecord, eye: Eye) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from drogue_models.untrusted_files import parse_json
 from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
@@ -70,8 +71,8 @@ class ModelMetadata:
             ValueError: it is not a JSON object with these keys, or a value is not allowed.
         """
         try:
-            values = json.loads(text)
-        except (ValueError, RecursionError) as error:
+            values = parse_json(text)
+        except ValueError as error:
             raise ValueError(f"metadata: is not JSON: {error}") from error
         if not isinstance(values, dict):
             raise ValueError(f"metadata: must be an object, got {type(values).__name__}")

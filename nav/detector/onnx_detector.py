@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from datasets_manifest.types.images import StereoImages
+from drogue_models.untrusted_files import read_regular
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
@@ -103,10 +107,9 @@ class OnnxDetector:
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:
-            maps: list[NDArray[Any]] = self._session.run(None, {self._input_name: batch})
+            return _run_until_interrupt(self._session, {self._input_name: batch})
         except _ORT_ERRORS as error:
             raise ValueError(f"{self._file}: does not run on {batch.shape}: {_first_line(error)}") from error
-        return maps
 
     def _check_maps(self, maps: list[NDArray[Any]], size_px: tuple[int, int]) -> None:
         want = [(len(EYES), MAP_CHANNELS, size_px[1] // stride, size_px[0] // stride) for stride in STRIDES]
@@ -119,7 +122,7 @@ class OnnxDetector:
 
 def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     try:
-        content = file.read_bytes()
+        content = read_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
     options = onnxruntime.SessionOptions()
@@ -128,11 +131,37 @@ def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     options.log_severity_level = _LOG_ERRORS
     # Waiting threads must not occupy the cores that rendering or another measurement uses.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # No folder: a network from memory would take weights from files below the working directory.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     try:
-        # From memory, so that a file cannot refer to other files.
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except _ORT_ERRORS as error:
         raise ValueError(f"{file}: is truncated or not an ONNX network: {_first_line(error)}") from error
+
+
+def _run_until_interrupt(
+    session: onnxruntime.InferenceSession, inputs: dict[str, NDArray[np.float32]]
+) -> list[NDArray[Any]]:
+    """The outputs of a network; Ctrl-C ends one that would run for ever.
+
+    Python hears of signals between its own instructions alone, and a network is none: it runs in another thread.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return list(session.run(None, inputs))
+    options, ended = onnxruntime.RunOptions(), Future[list[NDArray[Any]]]()
+
+    def run() -> None:
+        try:
+            ended.set_result(session.run(None, inputs, options))
+        except BaseException as error:
+            ended.set_exception(error)
+
+    threading.Thread(target=run, name="network", daemon=True).start()
+    try:
+        return ended.result()
+    except KeyboardInterrupt:
+        options.terminate = True
+        raise
 
 
 def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[str, tuple[int, int] | None]:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from drogue_models.untrusted_files import read_regular
 from nav.detector.detector_registry import network_file
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.onnx_conversion import import_onnx
@@ -70,7 +71,7 @@ def read_starting_weights(name_or_file: str) -> StartingWeights:
 
 def _from_onnx(path: Path) -> StartingWeights:
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: is missing; {_ADVICE}") from error
     except OSError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -11,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
+from drogue_models.untrusted_files import parse_toml, read_text
 from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 SizePx = tuple[int, int]
@@ -146,11 +146,13 @@ def build_settings(
     table: dict[str, Any] = {}
     if file is not None:
         try:
-            table = tomllib.loads(file.read_text(encoding="utf-8"))
+            table = parse_toml(read_text(file))
         except OSError as error:
             raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
-        except (ValueError, RecursionError) as error:
-            raise ValueError(f"{file}: is not TOML: {error}") from error
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{file}: is not valid TOML: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{file}: is {error}") from error
     try:
         return TrainingSettings.model_validate({**(network or {}), **table, **changes})
     except ValidationError as error:

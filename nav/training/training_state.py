@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from datasets_manifest.atomic import PART_SUFFIX, open_bytes_atomic
+from drogue_models.untrusted_files import read_regular
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.corpus import DatasetStamp
 from nav.training.training_progress import EpochRow
@@ -53,7 +54,7 @@ def load_checkpoint(path: Path, advice: str = "delete it, or train into another 
         ValueError: the file is truncated, or of another kind; the message names it.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
     except FileNotFoundError:
         return None
     except OSError as error:

@@ -6,7 +6,6 @@ import os
 import pickle
 import shutil
 import subprocess
-import tempfile
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +15,12 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from datasets_manifest.atomic import MEMORY_FOLDER, make_scratch_folder
 from render.blender_engine.interpreter import OLDEST_BLENDER, BlenderInterpreter, find_blender
 from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow, PictureRequest, pickled
 from render.device import Device
 from render.engine import EngineUnavailableError
 
-_MEMORY_FOLDER = Path("/dev/shm")
 _GRACE_S = 5.0
 # Blender gives rays that miss a depth of 1e10.
 _NOTHING_M = 1e9
@@ -51,8 +50,8 @@ class BlenderProcess:
 
     def __init__(self, interpreter: BlenderInterpreter | None = None, device: Device = "cpu") -> None:
         chosen = find_blender() if interpreter is None else interpreter
-        in_memory = _MEMORY_FOLDER.is_dir() and os.access(_MEMORY_FOLDER, os.W_OK)
-        self.folder = Path(tempfile.mkdtemp(prefix="droguekit-blender-", dir=_MEMORY_FOLDER if in_memory else None))
+        in_memory = MEMORY_FOLDER.is_dir() and os.access(MEMORY_FOLDER, os.W_OK)
+        self.folder = make_scratch_folder(MEMORY_FOLDER if in_memory else None)
         self._log = self.folder / "log.txt"
         try:
             self._process, self._answers = _start(chosen, self.folder, self._log, device)
@@ -140,8 +139,8 @@ def _start(
                 pass_fds=(write_end,),
                 # A signal to the engine's process group must not kill it before it cleans up; it ends with its input.
                 start_new_session=True,
-                # The user's start-up file and add-ons must not change pictures.
-                env={**os.environ, "BLENDER_USER_RESOURCES": str(folder)},
+                # The user's start-up file and add-ons must not change pictures. Blender leaves a folder in TMPDIR.
+                env={**os.environ, "BLENDER_USER_RESOURCES": str(folder), "TMPDIR": str(folder)},
             )
     except (OSError, ValueError):
         os.close(answers)

@@ -39,9 +39,12 @@ class MitsubaEngine:
         chosen = probe_variant(device)
         if chosen.library is not None:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(chosen.library)
+        import drjit as dr
         import mitsuba as mi
 
         mi.set_variant(chosen.variant)
+        # Processes that compile the same kernel at the same time warn that another one has stored it first.
+        dr.set_log_level(dr.LogLevel.Error)
         self.variant = chosen
         self.version = engine_version(chosen)
         if chosen.variant == "scalar_rgb":

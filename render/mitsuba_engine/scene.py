@@ -6,7 +6,6 @@ never rebuilt. Without a drogue the stage is the left camera's own frame.
 
 from __future__ import annotations
 
-import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import Sheen
 from geometry.se3 import RigidTransform
@@ -58,8 +58,8 @@ class DrogueScene:
         fronts = feature_surfaces(surfaces.fixed)
         self.features_m = _corners_m(fronts.values())
         self._drogue_m = _corners_m(surface.painted.mesh for surface in surfaces.fixed.values())
-        with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-            file = Path(folder) / "mesh.ply"
+        with scratch_folder() as folder:
+            file = folder / "mesh.ply"
             shapes = {name: _shape(name, surface, surface.painted.mesh, file) for name, surface in surfaces.all.items()}
             features = {name: _shape(name, surfaces.fixed[name], mesh, file) for name, mesh in fronts.items()}
         # Merging meshes would lose the parts' identity.

@@ -1,7 +1,8 @@
 """Which Mitsuba variant works here: on the processor LLVM's when its library does, else the scalar one; or a GPU's.
 
 An unsuitable library or driver can abort the whole process, which nothing can catch: it is tried in a process of its
-own, and the verdict is remembered per library or driver, drjit version and processor.
+own. That one works is remembered per library or driver, drjit version and processor. That one does not is forgotten
+with the run, as a machine may have been short of memory or time.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ import os
 import platform
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from datasets_manifest.atomic import make_scratch_folder
 from render.device import Device, kernel_module
 from render.engine import EngineUnavailableError
 
@@ -27,6 +31,8 @@ LLVM_REMEDY = "apt-get install libllvm19 (or another one from 17 on)"
 """Debian 12 has 19. Mitsuba 3.9.0 works with 15 too; 3.9.1 aborts the process with 15 and 16."""
 _OLDEST_LLVM = 15
 _PROBE_TIMEOUT_S = 120
+# Libraries that failed in this process or in the one that started it.
+_REJECTED = "DROGUEKIT_REJECTED_LLVM"
 # By these a user chooses a GPU, or the driver's libraries.
 _GPU_CHOICES = ("CUDA_VISIBLE_DEVICES", "DRJIT_LIBCUDA_PATH", "DRJIT_LIBOPTIX_PATH")
 _PROBE = """
@@ -74,7 +80,8 @@ def llvm_libraries() -> list[Path]:
     return [found[major] for major in sorted(found, reverse=True)]
 
 
-def _cache_file() -> Path:
+def verdicts_file() -> Path:
+    """Where it is remembered what works; delete the file to try everything again."""
     try:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
@@ -90,15 +97,21 @@ def _works(library: Path) -> bool:
     except OSError:
         return False
     key = "|".join([*_versions(), str(library), str(stamp), platform.processor(), _cpu_model()])
-    known = _verdicts().get(key)
-    if isinstance(known, bool):
-        return known
+    if _verdicts().get(key) is True:
+        return True
+    rejected = os.environ.get(_REJECTED, "").splitlines()
+    if key in rejected:
+        return False
     try:
         trial = _tried(["-c", _PROBE], {"DRJIT_LIBLLVM_PATH": str(library)})
         works = trial.returncode == 0 and b"works" in trial.stdout
     except subprocess.TimeoutExpired:
         works = False
-    _store_verdict(key, works)
+    if works:
+        _store_verdict(key, works)
+    else:
+        # Workers inherit it, so that they take the variant of the process that starts them and try nothing again.
+        os.environ[_REJECTED] = "\n".join([*rejected, key])
     return works
 
 
@@ -152,7 +165,7 @@ def _versions() -> tuple[str, str]:
 def _verdicts() -> dict[str, Any]:
     """What earlier processes found; empty where that cannot be read."""
     try:
-        verdicts = json.loads(_cache_file().read_text(encoding="utf-8"))
+        verdicts = json.loads(verdicts_file().read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return verdicts if isinstance(verdicts, dict) else {}
@@ -160,7 +173,7 @@ def _verdicts() -> dict[str, Any]:
 
 def _store_verdict(key: str, verdict: bool | str) -> None:
     """Keep a verdict for the next process; a cache that cannot be written only costs time."""
-    path, verdicts = _cache_file(), {**_verdicts(), key: verdict}
+    path, verdicts = verdicts_file(), {**_verdicts(), key: verdict}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.{os.getpid()}")
@@ -178,6 +191,42 @@ def _cpu_model() -> str:
     return match.group(1) if match else platform.machine()
 
 
+_KERNEL = re.compile(r"[0-9a-f]{32}\.(llvm|cuda|optix)\S*\.bin")
+# Of the format that Dr.Jit 1.0 to 1.4 writes: version, then sizes of the compressed contents and of three parts.
+_KERNEL_HEADER, _KERNEL_VERSION = "<BIIII", 5
+# Written within milliseconds; a process that was killed leaves its file for ever, and nobody writes that kernel again.
+_STALE_S = 600.0
+
+
+def kernel_cache() -> Path:
+    """The folder of Dr.Jit's compiled kernels."""
+    return Path(os.environ.get("HOME") or "~").expanduser() / ".drjit"
+
+
+def sweep_kernel_cache(folder: Path) -> None:
+    """Remove the kernels that cannot be loaded: empty, truncated, or left half-written; Dr.Jit would keep them."""
+    with suppress(OSError):
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            now_s = os.fstat(stream.fileno()).st_mtime  # by the clock of the disk, which may be another machine's
+        for entry in os.scandir(folder):
+            with suppress(OSError):
+                if _is_spoilt(Path(entry.path), now_s):
+                    Path(entry.path).unlink()
+
+
+def _is_spoilt(path: Path, now_s: float) -> bool:
+    if path.name.endswith(".tmp"):
+        return now_s - path.stat().st_mtime > _STALE_S
+    if not _KERNEL.fullmatch(path.name):
+        return False
+    with path.open("rb") as stream:
+        head, size = stream.read(struct.calcsize(_KERNEL_HEADER)), os.fstat(stream.fileno()).st_size
+    if size < struct.calcsize(_KERNEL_HEADER):
+        return True
+    version, compressed, *_ = struct.unpack(_KERNEL_HEADER, head)
+    return bool(version == _KERNEL_VERSION and size != struct.calcsize(_KERNEL_HEADER) + compressed)
+
+
 def _provide_home() -> None:
     """Give this process, and those that it starts, a home for Dr.Jit's compiled kernels where the user has none.
 
@@ -190,9 +239,9 @@ def _provide_home() -> None:
             return
     except OSError:
         pass
-    folder = tempfile.mkdtemp(prefix="droguekit-")
+    folder = make_scratch_folder()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["HOME"] = folder
+    os.environ["HOME"] = str(folder)
 
 
 def probe_variant(device: Device = "cpu") -> Variant:
@@ -210,6 +259,7 @@ def probe_variant(device: Device = "cpu") -> Variant:
             "engine mitsuba: not installed; install it with: pip install 'droguekit[mitsuba]'"
         ) from error
     _provide_home()
+    sweep_kernel_cache(kernel_cache())
     if device == "cuda":
         try:
             gpu = _gpu()

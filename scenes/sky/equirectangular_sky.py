@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.storage.image_codecs import check_pixel_count, decode_exr
+from datasets_manifest.storage.image_codecs import check_image_size, decode_exr
 from datasets_manifest.types.environment import EnvironmentMap, read_environment_map
 from geometry.bilinear_sampling import sample_bilinear
 from scenes.sky.photometry import Radiance, luminance
 
 _SMALLEST_PX = 16
+_HDR_PIXEL_BYTES = 12
 _LONGEST_HDR_HEADER = 65536  # our choice; a header has some hundred bytes
 # Reach of the sun's glow in a photograph, and of the ring around it that replaces it. [rad]
 _SPOT_RAD, _AROUND_RAD = np.radians(3.0), np.radians(8.0)
@@ -117,7 +118,7 @@ def _decode_hdr(data: bytes, file: Path) -> Radiance:
     size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:_LONGEST_HDR_HEADER])
     if size is not None:
         try:
-            check_pixel_count(int(size[1]), int(size[2]))
+            check_image_size(int(size[1]), int(size[2]), _HDR_PIXEL_BYTES, len(data))
         except ValueError as error:
             raise ValueError(f"environment.map: {file} {error}") from error
     try:

@@ -6,8 +6,10 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from droguekit.batch import cluster
 from droguekit.batch.cluster import ClusterTask, WorkerBuild, current_build
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
+from droguekit.batch.render_dataset import render_dataset
 from droguekit.batch.stop_request import StopRequest
 from droguekit.cli.main import WRONG_INPUT, run
 from render.engine import EngineUnavailableError
@@ -68,6 +71,7 @@ class OnFrame:
     def __init__(self, number: int, action: Callable[[], object]) -> None:
         self._left, self._action = number, action
         self.told: list[str] = []
+        self.on_line: Callable[[str], object] = lambda text: None
 
     def begin(self, what: str, total: int) -> None:
         """Nothing to do."""
@@ -82,6 +86,7 @@ class OnFrame:
 
     def say(self, text: str) -> None:
         self.told.append(text)
+        self.on_line(text)
 
     def end(self) -> None:
         """Nothing to do."""
@@ -90,9 +95,6 @@ class OnFrame:
 def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
     start: Start, scheduler: str, tmp_path: Path
 ) -> None:
-    from datasets_manifest.recipe.recipe import parse_recipe
-    from droguekit.batch.render_dataset import render_dataset
-
     text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
     render_recipe(tmp_path / "calm", text=text)
     workers = [worker(start, scheduler) for _ in range(3)]
@@ -115,9 +117,6 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
 
 
 def test_a_request_to_stop_finishes_the_frames_in_hand(start: Start, scheduler: str, tmp_path: Path) -> None:
-    from datasets_manifest.recipe.recipe import parse_recipe
-    from droguekit.batch.render_dataset import render_dataset
-
     text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
     worker(start, scheduler)
     report = OnFrame(2, lambda: os.kill(os.getpid(), signal.SIGINT))
@@ -130,6 +129,54 @@ def test_a_request_to_stop_finishes_the_frames_in_hand(start: Start, scheduler: 
     # Two were finished, and at most two more were with the one worker.
     assert 2 <= made <= 4
     assert report.told[-1] == f"stopped after {made} of 24 pairs, all of them complete"
+
+
+def render_on(address: str, out: Path, report: OnFrame) -> None:
+    source = RecipeSource(parse_recipe(ANALYTIC_RECIPE), ANALYTIC_RECIPE)
+    render_dataset(source, out, range(8), ExecutionOptions(0, scheduler=address), report)
+
+
+def test_a_run_without_workers_says_so_and_stops_at_once(scheduler: str, tmp_path: Path) -> None:
+    report = OnFrame(0, lambda: None)
+    report.on_line = lambda text: os.kill(os.getpid(), signal.SIGTERM) if "waiting" in text else None
+    with pytest.raises(KeyboardInterrupt):
+        render_on(scheduler, tmp_path / "out", report)
+    assert report.told == [
+        "the Dask scheduler has no workers; waiting for some to join",
+        "stopped after 0 of 8 pairs, all of them complete",
+    ]
+
+
+@pytest.fixture
+def silence() -> Iterator[socket.socket]:
+    """A program that accepts connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        yield listener
+
+
+def test_a_port_where_something_else_listens_is_given_up(
+    silence: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    address = f"tcp://127.0.0.1:{silence.getsockname()[1]}"
+    with pytest.raises(OSError, match=rf"--scheduler: no Dask scheduler answers at {address}: what listens there said"):
+        render_on(address, tmp_path / "out", OnFrame(0, lambda: None))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_request_to_stop_ends_the_wait_for_the_scheduler(silence: socket.socket, tmp_path: Path) -> None:
+    def stop_when_it_connects() -> None:
+        with silence.accept()[0]:
+            os.kill(os.getpid(), signal.SIGTERM)
+            ended.wait()
+
+    ended = threading.Event()
+    thread = threading.Thread(target=stop_when_it_connects)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        render_on(f"tcp://127.0.0.1:{silence.getsockname()[1]}", tmp_path / "out", OnFrame(0, lambda: None))
+    ended.set()
+    thread.join()
 
 
 @pytest.mark.slow  # Dask starts the worker anew four times

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import fcntl
+import io
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -12,12 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
-from droguekit.batch.frame_task import FrameTask
-from droguekit.batch.worker_pool import run_in_own_process
+from droguekit.batch import render_dataset as rendering
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.batch.frame_task import FrameReport, FrameTask
+from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import EventLog, make_frames, render_dataset
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerDiedError, run_in_own_process
 from render.engine import EngineUnavailableError
 from tests.support.batch_datasets import ANALYTIC_RECIPE, TINY_RECIPE, file_hashes, render_recipe
 
@@ -26,6 +32,67 @@ def test_reverse_order_and_two_workers_give_the_same_files(tiny_dataset: Path, t
     summary = render_recipe(tmp_path / "again", [3, 2, 1, 0], 2)
     assert summary.dataset_sha256 == read_manifest(tiny_dataset).dataset_sha256
     assert file_hashes(tmp_path / "again") == file_hashes(tiny_dataset)
+
+
+class Deleting(PlainProgress):
+    """A progress report during which somebody deletes a place, once so many frames are finished."""
+
+    def __init__(self, place: Path, frames: int) -> None:
+        super().__init__(io.StringIO())
+        self._place, self._left = place, frames
+
+    def advance(self) -> None:
+        super().advance()
+        self._left -= 1
+        if self._left == 0:
+            shutil.rmtree(self._place)
+
+
+@pytest.mark.parametrize(("place", "lost"), [("frames/000001", [1]), ("frames", [0, 1, 2]), ("", [0, 1, 2])])
+def test_frames_that_vanish_during_the_run_are_named(
+    place: str, lost: list[int], analytic_dataset: Path, tmp_path: Path
+) -> None:
+    out, source = tmp_path / "out", RecipeSource(parse_recipe(ANALYTIC_RECIPE), ANALYTIC_RECIPE)
+    for index in (0, 1):
+        shutil.copytree(layout.frame_folder(analytic_dataset, index), layout.frame_folder(out, index))
+    for name in (layout.MANIFEST_FILE, layout.RECIPE_FILE):
+        shutil.copy(analytic_dataset / name, out / name)
+    # Two of them were there before, and one is made.
+    summary = render_dataset(source, out, range(4), 0, Deleting(out / place, 1))
+    assert [drop.frame_index for drop in summary.drops] == lost
+    assert all("somebody deleted it during the run" in drop.reason for drop in summary.drops)
+    assert read_manifest(out).drops == summary.drops
+    assert (out / layout.RECIPE_FILE).read_text() == ANALYTIC_RECIPE
+    again = render_dataset(source, out, range(8), 0, PlainProgress(io.StringIO()))
+    assert again.drops == () and again.dataset_sha256 == read_manifest(analytic_dataset).dataset_sha256
+
+
+def accident(index: int, number: int, code: int = -signal.SIGILL) -> TaskAttempt[FrameReport]:
+    return TaskAttempt(index, number, None, WorkerDiedError(code), final=number == MAX_ATTEMPTS)
+
+
+@pytest.mark.parametrize(("workers", "most"), [(2, 9), (16, 32)])
+def test_a_death_that_the_first_frames_share_ends_the_run(
+    workers: int, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = [accident(index, number) for number in (1, 2, 3) for index in range(100)]
+    monkeypatch.setattr(rendering, "run_tasks", lambda *_: (attempt for attempt in attempts))
+    told, task = io.StringIO(), FrameTask(parse_recipe(TINY_RECIPE), tmp_path)
+    expected = rf"no frame can be made: {most} attempts failed, the last: its worker process died \(SIGILL\); .*\.drjit"
+    with pytest.raises(OSError, match=expected):
+        make_frames(task, range(100), ExecutionOptions(workers), PlainProgress(told), EventLog(io.StringIO()))
+    assert len(told.getvalue().splitlines()) == most - 1
+
+
+def test_deaths_after_a_frame_is_made_cost_their_frames_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = TaskAttempt(100, 1, FrameReport("here", 1.0, {}, None, 1), None, final=True)
+    attempts = [made, *(accident(index, number) for number in (1, 2, 3) for index in range(100))]
+    monkeypatch.setattr(rendering, "run_tasks", lambda *_: (attempt for attempt in attempts))
+    task, told = FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path), io.StringIO()
+    totals, drops = make_frames(task, range(101), ExecutionOptions(2), PlainProgress(told), EventLog(io.StringIO()))
+    assert (totals.made, totals.retries, len(drops)) == ([100], 200, 100)
+    # Only the engine with a cache of kernels is said to have one.
+    assert drops[0].reason == "its worker process died (SIGILL), attempt 3 of 3"
 
 
 def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, tmp_path: Path) -> None:

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
-from datasets_manifest.storage.image_codecs import MOST_PIXELS, check_pixel_count, decode_exr, decode_png, encode_png
+from datasets_manifest.storage.image_codecs import (
+    MOST_PIXELS,
+    check_image_size,
+    decode_exr,
+    decode_png,
+    encode_png,
+    read_passes,
+)
 from geometry.pinhole import PinholeCamera
 
 
@@ -95,8 +104,33 @@ def test_a_png_without_a_header_is_named() -> None:
 @pytest.mark.parametrize("size", [(0, 5), (-3, 5), (MOST_PIXELS, 2)])
 def test_counts_of_pixels_that_no_image_has(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="pixels, got"):
-        check_pixel_count(*size)
-    check_pixel_count(MOST_PIXELS, 1)
+        check_image_size(*size, bytes_per_px=1, file_bytes=10**9)
+    check_image_size(MOST_PIXELS, 1, bytes_per_px=1, file_bytes=10**9)
+
+
+def test_a_small_file_holds_no_large_image() -> None:
+    # A dark image of 12 million pixels is a few kilobytes as PNG, and all of them are allowed.
+    check_image_size(4000, 3000, bytes_per_px=6, file_bytes=12_000)
+    check_image_size(12_000, 10_000, bytes_per_px=6, file_bytes=7_200_000)
+    with pytest.raises(ValueError, match="must not expand more than 100 times, got 7199999 bytes of 720000000"):
+        check_image_size(12_000, 10_000, bytes_per_px=6, file_bytes=7_199_999)
+    # By its rig and its header it is right.
+    data = png_of_zeros(20_000, 20_000)
+    with pytest.raises(ValueError, match=r"^x\.png: must (not expand|have 1 to)"):
+        decode_png(data, "x.png", camera_of(20_000, 20_000))
+
+
+def test_an_exr_file_of_many_channels_never_reaches_the_decoder(tmp_path: Path) -> None:
+    """A megabyte of zeros in a hundred channels, of which each has the size of the rig."""
+    camera, planes = camera_of(1000, 800), np.zeros((800, 1000), np.float32)
+    OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage},
+        {f"c{number}": planes for number in range(100)},
+    ).write(str(tmp_path / "bomb.exr"))
+    data = (tmp_path / "bomb.exr").read_bytes()
+    assert len(data) < 2**20
+    with pytest.raises(ValueError, match="must not expand more than 100 times"):
+        read_passes(data, "bomb.exr", camera)
 
 
 def test_an_exr_file_that_claims_too_many_pixels_never_reaches_the_decoder() -> None:

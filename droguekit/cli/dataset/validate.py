@@ -29,14 +29,14 @@ def validate(
     With --published, also check whether it is the published dataset: bit for bit, or with the same labels where it was
     made with other packages or on another processor.
 
-    Exits with 1 and prints a line for each fault it finds.
+    Exits with 1 and prints a line for each fault it finds, up to 100 of a kind.
     """
     from labelgen.validation.dataset_checks import validate_dataset
 
     report = validate_dataset(dataset)
     typer.echo(report.table())
-    for fault in report.faults:
-        typer.echo(fault)
+    for line in report.fault_lines():
+        typer.echo(line)
     typer.echo(f"{dataset}: {report.pairs} pairs, {len(report.faults) or 'no'} faults")
     if not report.passed:
         raise typer.Exit(FAULT)

@@ -35,6 +35,10 @@ COMPONENTS = ("x", "y", "z", "pitch", "yaw")
 # Larger than any length, speed or time in flight; its square is far from overflow.
 _LARGEST_PLAUSIBLE = 1e9
 Parts = Mapping[str, slice]
+MOST_METHODS = 100
+"""Most methods that are scored together: each has rows, plots and comparisons with the others."""
+# Difference of the correlations above and below the diagonal; printed digits and floats of 32 bits stay below it.
+_MOST_ASYMMETRY = 1e-3
 # A larger square means that the covariance is meaningless; it would dominate every mean.
 _MOST_SQUARE = 1e100
 # Position, attitude and both together, as slices of the five components.
@@ -87,8 +91,8 @@ def estimates_by_method(
         source: what to call the file in errors.
 
     Raises:
-        ValueError: no estimates, one for a pair that the dataset lacks, two of a method for the same pair, or a
-            number that is implausibly large.
+        ValueError: no estimates, too many methods, an estimate for a pair that the dataset lacks, two of a method for
+            the same pair, or a number that is implausibly large.
     """
     known = set(frame_indices)
     methods: dict[str, dict[int, Estimate]] = {}
@@ -97,6 +101,8 @@ def estimates_by_method(
         if index not in known:
             raise ValueError(f"{source}: method {method!r}: frame {index} is not in the dataset")
         frames = methods.setdefault(method, {})
+        if len(methods) > MOST_METHODS:
+            raise ValueError(f"{source}: holds more than {MOST_METHODS} methods; split it and score the parts")
         if index in frames:
             raise ValueError(f"{source}: method {method!r}: frame {index} occurs twice")
         largest = _largest_number(estimate)
@@ -176,8 +182,8 @@ def squared_errors(estimate: PoseEstimate, error: PoseError) -> Array | None:
         error: of its pose.
 
     Returns:
-        (3,) of 3, 2 and 5 degrees of freedom, or None where the covariance is not positive definite, too small or too
-        large for floats, or in another tangent than ours.
+        (3,) of 3, 2 and 5 degrees of freedom, or None where the covariance is not symmetric and positive definite, too
+        small or too large for floats, or in another tangent than ours.
 
     Source: e^T C^-1 e, Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
     """
@@ -192,14 +198,14 @@ def normalized_squares(error: Array, covariance: Array, parts: Parts) -> Array |
     """(len(parts),) `e^T C^-1 e` of parts of an error.
 
     Returns:
-        None where the covariance is not positive definite, or too small or too large for floats.
+        None where the covariance is not symmetric and positive definite, or too small or too large for floats.
     """
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0))
     if not deviations.all():
         return None
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         scaled, whole = covariance / np.outer(deviations, deviations), error / deviations
-        if not np.isfinite(scaled).all():
+        if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > _MOST_ASYMMETRY:
             return None
         try:
             squares = np.array(

@@ -26,6 +26,9 @@ _IMAGE_CORNER = (-0.5, -0.5)
 # OpenCV gets coordinates in 1/16 px, so that lines lie where the labels say.
 _SHIFT = 4
 
+# OpenCV has integers of 32 bits.
+_FARTHEST_PX = 1e6
+
 
 def display_picture(images: StereoImages) -> Picture:
     """(H, W, 3) left image in sRGB, for a screen."""
@@ -87,8 +90,9 @@ def draw_crosses(
 
 
 def _fixed_point(point: PixelPoint, scale: float, corner: PixelPoint) -> tuple[int, int]:
-    """Where an image point lies in a cut-out, in OpenCV's fixed point."""
+    """Where an image point lies in a cut-out, in OpenCV's fixed point; points far outside stay outside."""
     x, y = ((value - low) * scale - 0.5 for value, low in zip(point, corner, strict=True))
+    x, y = (min(max(place, -_FARTHEST_PX), _FARTHEST_PX) for place in (x, y))
     return round(x * 2**_SHIFT), round(y * 2**_SHIFT)
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from datasets_manifest.atomic import open_text_atomic
 from datasets_manifest.types.records import PixelBox
+from drogue_models.untrusted_files import MOST_BYTES, parse_json, read_text
 from droguekit.scoring.confidence_intervals import Interval
 from droguekit.scoring.results.pose_result import ResultModel
 from droguekit.scoring.results.sequence_result import Tracking
@@ -249,10 +250,10 @@ def read_detections(path: Path, image_ids: Collection[int]) -> list[DetectedBox]
         ValueError: it cannot be read, is no list of results, or names other images or categories; names the file.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = parse_json(read_text(path, MOST_BYTES), with_nan=True)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     if not isinstance(table, list):
         raise ValueError(f"{path}: must hold a list of COCO results, got {type(table).__name__}")

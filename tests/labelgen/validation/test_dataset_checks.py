@@ -178,7 +178,7 @@ def test_a_coco_file_without_annotations_is_a_fault(small_dataset: Path) -> None
     table = json.loads(path.read_text())
     del table["annotations"]
     path.write_text(json.dumps(table))
-    assert f"{path}: is truncated or not a COCO file: 'annotations'" in faults_of(small_dataset)
+    assert f"{path}: is truncated or not a COCO file: has no 'annotations'" in faults_of(small_dataset)
 
 
 def test_a_path_out_of_the_frame_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:

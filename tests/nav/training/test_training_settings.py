@@ -35,7 +35,7 @@ def test_settings_come_from_a_file_and_changes_precede_it(tmp_path: Path) -> Non
     settings = build_settings(file, {"learning_rate": 0.004})
     assert (settings.variant, settings.learning_rate, settings.size_px) == ("s", 0.004, (320, 416))
     file.write_text("variant = \n")
-    with pytest.raises(ValueError, match=r"mine\.toml: is not TOML"):
+    with pytest.raises(ValueError, match=r"mine\.toml: is not valid TOML"):
         build_settings(file, {})
     with pytest.raises(ValueError, match=r"none\.toml: cannot be read"):
         build_settings(tmp_path / "none.toml", {})

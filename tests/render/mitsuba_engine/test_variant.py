@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -81,6 +82,88 @@ def test_a_home_that_cannot_be_written_does_not_stop_mitsuba(home: str | None, t
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, probe_variant().variant), done.stderr
     assert list(tmp_path.glob("droguekit-*")) == []
+
+
+class LlvmTrials:
+    """Stands in for the process that tries an LLVM library; None for one that takes too long."""
+
+    def __init__(self, *ends: int | None) -> None:
+        self.ends = [*ends]
+
+    def __call__(self, arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[bytes]:
+        status = self.ends.pop(0)
+        if status is None:
+            raise subprocess.TimeoutExpired(arguments, 1.0)
+        return subprocess.CompletedProcess(arguments, status, b"works" if status == 0 else b"", b"")
+
+
+@pytest.mark.parametrize("end", [None, -9, -6, 1])
+def test_only_what_works_is_remembered_of_a_library(
+    end: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = tmp_path / "libLLVM-19.so.1"
+    library.touch()
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(library))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("DROGUEKIT_REJECTED_LLVM", "")
+    monkeypatch.setattr(variant, "_tried", LlvmTrials(end, 0))
+    # A process and the workers that it starts agree.
+    assert [probe_variant().variant for _ in range(2)] == ["scalar_rgb", "scalar_rgb"]
+    assert not variant.verdicts_file().exists()
+    # The next run tries again.
+    monkeypatch.setenv("DROGUEKIT_REJECTED_LLVM", "")
+    assert [probe_variant().variant for _ in range(2)] == ["llvm_ad_rgb", "llvm_ad_rgb"]
+    # What an older version wrote.
+    verdicts = json.loads(variant.verdicts_file().read_text())
+    variant.verdicts_file().write_text(json.dumps(dict.fromkeys(verdicts, False)))
+    monkeypatch.setattr(variant, "_tried", LlvmTrials(0))
+    assert probe_variant().variant == "llvm_ad_rgb"
+
+
+_SQUARE = (
+    "from render.mitsuba_engine.variant import probe_variant\n"
+    "probe_variant(); import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr\n"
+    "x = mi.Float(3.0) + dr.opaque(mi.Float, 1.5); dr.eval(x * x)"
+)
+
+
+def compile_kernel(home: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "HOME": str(home), "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run([sys.executable, "-c", _SQUARE], env=environment, capture_output=True, text=True, check=False)
+
+
+def kernels(home: Path) -> list[Path]:
+    return sorted((home / ".drjit").iterdir())
+
+
+def test_kernels_that_cannot_be_loaded_are_swept(tmp_path: Path) -> None:
+    if probe_variant().variant != "llvm_ad_rgb":
+        pytest.skip("no LLVM here")
+    done = compile_kernel(tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    whole = {path: path.read_bytes() for path in kernels(tmp_path)}
+    for path, damaged in zip(whole, (b"", b"\5\0", whole[kernels(tmp_path)[-1]][:-1]), strict=False):
+        path.write_bytes(damaged)
+        stale = path.with_name(f"{path.name}.tmp")
+        stale.touch()
+        os.utime(stale, (0, 0))
+    done = compile_kernel(tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert {path: path.read_bytes() for path in kernels(tmp_path)} == whole
+
+
+def test_a_sweep_leaves_whole_kernels_and_all_else(tmp_path: Path) -> None:
+    contents = {
+        f"{'0' * 32}.llvm.bin": struct.pack("<BIIII", 5, 4, 9, 9, 9) + b"1234",
+        f"{'1' * 32}.llvm.v7.bin": struct.pack("<BIIII", 7, 99, 9, 9, 9) + b"of a later version",
+        f"{'2' * 32}.llvm.bin.tmp": b"being written",
+        "notes.txt": b"",
+    }
+    for name, data in contents.items():
+        (tmp_path / name).write_bytes(data)
+    variant.sweep_kernel_cache(tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == contents
+    variant.sweep_kernel_cache(tmp_path / "none")
 
 
 def refusal() -> str:

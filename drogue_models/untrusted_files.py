@@ -1,0 +1,161 @@
+"""Reads files that may come from anybody: regular ones only, up to a size, with JSON and TOML up to a depth.
+
+A pipe would wait for ever, a device such as /dev/zero has no end, and a megabyte of brackets overflows the stack of a
+parser that calls itself.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+import numpy as np
+
+MOST_BYTES = 2**30
+"""Most bytes of a file that is read as a whole."""
+MOST_TEXT_BYTES = 2**20
+"""Most bytes of a file that people write: a recipe, a drogue, settings, a calibration."""
+MOST_NESTING = 100
+"""Deepest nesting of JSON and TOML; the deepest file of our own has 12 levels."""
+MOST_DIGITS = 300
+"""Most digits of a whole number in JSON and TOML: larger ones are no float."""
+
+_BLOCK_BYTES = 2**20
+# What does not matter for the nesting of TOML: texts and comments. A text that does not end reaches to the end.
+_TOML_TEXTS = re.compile(
+    r'"""(?:[^\\"]|\\.|"(?!""))*+(?:"{3,5}|\Z)'
+    r"|'''(?:[^']|'(?!''))*+(?:'{3,5}|\Z)"
+    r'|"(?:[^"\\\n]|\\.)*+(?:"|$)'
+    r"|'[^'\n]*+(?:'|$)"
+    r"|#[^\n]*+",
+    re.DOTALL | re.MULTILINE,
+)
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_NESTING}}}")
+_LONG_NUMBER = re.compile(rf"[0-9_]{{{MOST_DIGITS + 1}}}")
+
+
+def open_regular(path: Path, in_folder: bool = False) -> BinaryIO:
+    """Open a regular file, or a link to one, for reading.
+
+    Args:
+        path: of the file.
+        in_folder: whether a link must lead to a file of the same folder.
+
+    Raises:
+        OSError: it is missing, a folder, a pipe, a socket or a device, or leads out of its folder; has the file's name.
+    """
+    # Without O_NONBLOCK, opening a pipe waits for a writer. What was opened is looked at, not what the name means now.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if in_folder and Path(f"/proc/self/fd/{descriptor}").readlink().parent != path.parent.resolve():
+            raise OSError(errno.ELOOP, "leads outside its folder", str(path))
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "is a pipe, socket or device, not a regular file", str(path))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_regular(path: Path, most_bytes: int = MOST_BYTES, in_folder: bool = False) -> bytes:
+    """The contents of a regular file of at most so many bytes.
+
+    Raises:
+        OSError: as of `open_regular`, or it has more bytes.
+    """
+    with open_regular(path, in_folder) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        # A file may grow while it is read.
+        data = b"" if size > most_bytes else stream.read(most_bytes + 1)
+    if size > most_bytes or len(data) > most_bytes:
+        raise OSError(errno.EFBIG, f"has more than {most_bytes} bytes, which are too many for such a file", str(path))
+    return data
+
+
+def read_text(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
+    """The contents of a regular file of UTF-8 text, with or without a byte order mark.
+
+    Raises:
+        OSError: as of `read_regular`.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_regular(path, most_bytes).decode("utf-8-sig")
+
+
+def parse_json(data: bytes | str, with_nan: bool = False) -> Any:
+    """The value in a JSON text.
+
+    Args:
+        data: the text.
+        with_nan: whether to read NaN and Infinity, which are not JSON, but which other programs write.
+
+    Raises:
+        ValueError: not JSON, nested deeper than `MOST_NESTING`, a number that is not finite, or one of too many digits.
+    """
+    encoded = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
+    if _json_depth(encoded) > MOST_NESTING:
+        raise ValueError(f"is nested more than {MOST_NESTING} levels deep")
+    try:
+        text = data if isinstance(data, str) else data.decode(json.detect_encoding(data))
+        parse_int = _whole_number if _LONG_NUMBER.search(text) else None
+        return json.loads(text, parse_constant=None if with_nan else _refuse_constant, parse_int=parse_int)
+    except RecursionError as error:
+        raise ValueError("is nested too deep") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The table in a TOML text.
+
+    Raises:
+        ValueError: not TOML, too large, nested or with keys of more parts than `MOST_NESTING`, or a number of too many
+            digits.
+    """
+    if len(text) > MOST_TEXT_BYTES:
+        raise ValueError(f"not valid TOML: has more than {MOST_TEXT_BYTES} characters")
+    plain = _TOML_TEXTS.sub("a", text)
+    depth, deepest = 0, 0
+    for bracket in re.findall(r"[\[{\]}]", plain):
+        depth += 1 if bracket in "[{" else -1
+        deepest = max(deepest, depth)
+    if deepest > MOST_NESTING or _LONG_KEY.search(plain):
+        raise ValueError(f"not valid TOML: is nested more than {MOST_NESTING} levels deep")
+    if _LONG_NUMBER.search(plain):
+        raise ValueError(f"not valid TOML: has a number of more than {MOST_DIGITS} digits")
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"not valid TOML: {error}") from error
+
+
+def _json_depth(data: bytes) -> int:
+    """The deepest nesting of brackets outside of texts."""
+    if b"\\" in data:
+        data = re.sub(rb"\\.", b"", data, flags=re.DOTALL)
+    in_text, depth, deepest = 0, 0, 0
+    for start in range(0, len(data), _BLOCK_BYTES):
+        block = np.frombuffer(data, np.uint8, min(_BLOCK_BYTES, len(data) - start), start)
+        quotes = np.cumsum(block == ord('"'), dtype=np.int32) + in_text
+        low = block | 0x20  # makes [ and {, and ] and }, the same
+        steps = (low == ord("{")).astype(np.int32) - (low == ord("}"))
+        depths = np.cumsum(np.where(quotes & 1, 0, steps), dtype=np.int64) + depth
+        in_text, depth, deepest = int(quotes[-1]) & 1, int(depths[-1]), max(deepest, int(depths.max()))
+    return deepest
+
+
+def _whole_number(text: str) -> int:
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"has a number of {len(text)} digits, at most {MOST_DIGITS} are read")
+    return int(text)
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"holds {name}, which is no number of JSON")
