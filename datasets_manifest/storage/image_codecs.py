@@ -82,7 +82,7 @@ def png_fault(data: bytes, camera: PinholeCamera) -> str | None:
     if not data.startswith(_PNG_SIGNATURE):
         return "not a PNG file"
     position = len(_PNG_SIGNATURE)
-    if len(data) < position + 16:
+    if len(data) < position + 18:
         return "the PNG is truncated"
     if data[position + 4 : position + 8] != b"IHDR":
         return "the PNG is damaged (no header)"

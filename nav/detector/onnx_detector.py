@@ -156,8 +156,8 @@ def _run_until_interrupt(
         except BaseException as error:
             ended.set_exception(error)
 
-    threading.Thread(target=run, name="network", daemon=True).start()
     try:
+        threading.Thread(target=run, name="network", daemon=True).start()
         return ended.result()
     except KeyboardInterrupt:
         options.terminate = True

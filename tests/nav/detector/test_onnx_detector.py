@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -233,3 +235,67 @@ def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"network\.onnx: cannot be written"):
         export_onnx(make_network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)
     assert [path.name for path in tmp_path.iterdir()] == ["network.onnx"]
+
+
+def test_weights_in_another_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even below the working directory."""
+    file = write_red_squares(tmp_path, metadata=METADATA)
+    model = onnx.load(file)
+    onnx.save(model, file, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    assert (tmp_path / "weights.bin").stat().st_size > 0
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="is truncated or not an ONNX network") as caught:
+        OnnxDetector(file)
+    one_line(caught, file)
+
+
+def write_endless_network(path: Path) -> Path:
+    """A network whose loop takes longer than anybody waits."""
+    true = helper.make_tensor("go_on", TensorProto.BOOL, [], [True])
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["cond_in"], ["cond_out"]),
+            helper.make_node("Identity", ["state"], ["state_out"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("count", TensorProto.INT64, []),
+            helper.make_tensor_value_info("cond_in", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("state", TensorProto.FLOAT, [2, 3, 64, 64]),
+        ],
+        [
+            helper.make_tensor_value_info("cond_out", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("state_out", TensorProto.FLOAT, [2, 3, 64, 64]),
+        ],
+    )
+    graph = helper.make_graph(
+        [helper.make_node("Loop", ["", "go_on", "images"], ["found"], body=body)],
+        "endless",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [2, 3, 64, 64])],
+        [helper.make_tensor_value_info("found", TensorProto.FLOAT, [2, 3, 64, 64])],
+        [true],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def test_an_endless_network_hears_of_an_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, threads = write_endless_network(tmp_path / "endless.onnx"), []
+    begin = threading.Thread.start
+
+    def start(thread: threading.Thread) -> None:
+        threads.append(thread)
+        begin(thread)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(threading.Thread, "start", start)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            OnnxDetector(file)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    # The network itself ends too.
+    threads[-1].join()

@@ -1,0 +1,129 @@
+"""Pipes, devices and endless files where a command expects a file: one line, at once."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.calibration.calibration_files import write_calibration
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.reader import Dataset
+from droguekit.cli.main import FAULT, WRONG_INPUT, run
+from geometry.pinhole import PinholeCamera
+from geometry.stereo import StereoRig
+from labelgen.validation.dataset_checks import validate_dataset
+from tests.support.whole_dataset import write_whole_dataset
+
+Replace = Callable[[Path], None]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("special") / "whole"
+    write_whole_dataset(folder)
+    return folder
+
+
+@pytest.fixture
+def dataset(whole: Path, tmp_path: Path) -> Path:
+    shutil.copytree(whole, tmp_path / "dataset")
+    return tmp_path / "dataset"
+
+
+def by_pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def by_device(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to("/dev/zero")
+
+
+def by_terabyte(path: Path) -> None:
+    """A file that takes no room on the disk."""
+    path.touch()
+    os.truncate(path, 2**40)
+
+
+REPLACEMENTS = {"pipe": by_pipe, "device": by_device, "terabyte": by_terabyte}
+
+
+@pytest.fixture(params=REPLACEMENTS)
+def replace(request: pytest.FixtureRequest) -> Replace:
+    found: Replace = REPLACEMENTS[request.param]
+    return found
+
+
+def refusal(*arguments: str | Path) -> str:
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = run([str(argument) for argument in arguments])
+    assert code == WRONG_INPUT, out.getvalue() + err.getvalue()
+    (line,) = [line for line in err.getvalue().splitlines() if line.startswith("droguekit: error: ")]
+    return line
+
+
+def test_a_file_of_a_dataset(dataset: Path, tmp_path: Path, replace: Replace) -> None:
+    replace(dataset / "manifest.json")
+    for command in (
+        ["navigate", "--out", tmp_path / "e.jsonl"],
+        ["export", "--format", "coco", "--out", tmp_path / "c"],
+    ):
+        assert "manifest.json: cannot be read: " in refusal(command[0], dataset, *command[1:])
+    (fault,) = validate_dataset(dataset).faults
+    assert "manifest.json: cannot be read: " in fault
+
+
+@pytest.mark.parametrize(
+    "name", ["record.json", "left.png", "right_parts.png", "left.exr", "all.json", "opencv_stereo.yaml"]
+)
+def test_a_file_of_a_frame_is_a_fault_beside_others(dataset: Path, name: str, replace: Replace) -> None:
+    folder = {"all.json": dataset / "annotations", "opencv_stereo.yaml": dataset / "calibration"}
+    path = folder.get(name, frame_folder(dataset, 1)) / name
+    replace(path)
+    with redirect_stdout(io.StringIO()) as told:
+        assert run(["validate", str(dataset)]) == FAULT
+    assert str(path) in told.getvalue()
+    assert "3 pairs" in told.getvalue()
+    if name == "record.json":
+        with pytest.raises(ValueError, match=r"record\.json: (cannot be read|leads outside)"):
+            Dataset(dataset).record(1)
+
+
+def test_files_that_a_user_names(dataset: Path, tmp_path: Path, replace: Replace) -> None:
+    pipe = tmp_path / "pipe.toml"
+    replace(pipe)
+    assert f"{pipe}: cannot be read: " in refusal("render", pipe, "--out", tmp_path / "out")
+    assert f"{pipe}: cannot be read: " in refusal("model", pipe, "--out", tmp_path / "m.ply")
+    assert f"{pipe}" in refusal("benchmark", dataset, "--estimates", pipe)
+    assert f"{pipe}: cannot be read: " in refusal("benchmark", dataset, "--detections", pipe)
+    network = tmp_path / "pipe.onnx"
+    replace(network)
+    assert f"{network}: cannot be read: " in refusal("detect", dataset, "--detector", network, "--out", tmp_path / "d")
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_files_of_an_import(tmp_path: Path, replace: Replace) -> None:
+    for eye in ("left", "right"):
+        (tmp_path / "in" / eye).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "in" / eye / "1.png"), np.zeros((12, 16), np.uint8))
+    write_calibration(tmp_path, StereoRig(PinholeCamera(16, 12, 20.0, 20.0, 7.5, 5.5), 0.1))
+    calibration, boxes = tmp_path / "calibration" / "opencv_stereo.yaml", tmp_path / "boxes.json"
+    other = tmp_path / "other.yaml"
+    replace(boxes)
+    command = ["import", tmp_path / "in", "--out", tmp_path / "out", "--calibration", calibration]
+    assert f"{boxes}: cannot be read: " in refusal(*command, "--boxes", boxes)
+    replace(other)
+    assert str(other) in refusal(*command[:-1], other)
+    replace(tmp_path / "in" / "left" / "1.png")
+    assert "left" in refusal(*command)
+    assert not (tmp_path / "out").exists()
