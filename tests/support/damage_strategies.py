@@ -44,10 +44,16 @@ _TEXTS = ["", "left", "../../secret", "/etc/passwd", "a/../../b", "\0", "x" * 50
 HOSTILE = st.sampled_from([None, *_NUMBERS, *_TEXTS, [], {}, [[]], [None] * 40, {"left": 1}, [1e200] * 3])
 
 
+# What parsers choke on: nesting, a number of many digits, a key of many parts, control characters, other digits.
+_MONSTERS = [b"[" * 20_000, b'{"a":' * 5_000, b"1" * 5_000, b"a." * 20_000 + b"a = 1", b"<a>" * 5_000, b"- " * 5_000]
+_MONSTERS += [b"\x1b]0;x\x07", "\u0663\u202e".encode(), b"NaN", b"1e999", b"&a [*a, *a]", b'"' * 99]
+
+
 @st.composite
 def byte_edits(draw: st.DrawFn) -> Edit:
-    """A change of a file's bytes: cut, turn over, double, insert."""
-    kind = draw(st.sampled_from(["cut", "flip", "insert", "double", "empty"]))
+    """A change of a file's bytes: cut, turn over, double, insert, and nested or endless numbers where text is read."""
+    kind = draw(st.sampled_from(["cut", "flip", "insert", "double", "empty", "monster"]))
+    monster = draw(st.sampled_from(_MONSTERS))
     place, length = draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(1, 40))
     junk = draw(st.binary(min_size=1, max_size=40))
 
@@ -59,6 +65,8 @@ def byte_edits(draw: st.DrawFn) -> Edit:
             return b""
         if kind == "double":
             return data[:at] + data
+        if kind == "monster":
+            return data[:at] + monster + data[at:]
         middle = junk if kind == "insert" else bytes(byte ^ junk[0] | 1 for byte in data[at : at + length])
         return data[:at] + middle + data[at + (0 if kind == "insert" else length) :]
 
