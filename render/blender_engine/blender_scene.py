@@ -437,6 +437,7 @@ def _compiled(source: str, folder: Path) -> str:
     cycles: Any = importlib.import_module("_cycles")
     text, result = folder / "real_eye.osl", folder / "real_eye.oso"
     text.write_text(source, encoding="ascii")
-    if not cycles.osl_compile(str(text), str(result)):
+    compile_ = getattr(cycles, "osl_compile", None)  # missing from Debian's Blender, for one
+    if compile_ is None or not compile_(str(text), str(result)):
         raise RuntimeError("this Blender was built without Open Shading Language, which real lenses need")
     return result.read_text(encoding="ascii")

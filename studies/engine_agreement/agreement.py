@@ -52,7 +52,7 @@ class Requirement:
     @property
     def reached(self) -> bool:
         """Whether the figure is within its limit."""
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
+        return bool(self.value >= self.limit if self.at_least else self.value <= self.limit)
 
 
 def frame_requirements(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Requirement]:

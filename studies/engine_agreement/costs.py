@@ -54,7 +54,7 @@ class CostComparison:
     @property
     def is_reached(self) -> bool:
         """Whether the second engine reached the noise of the first."""
-        return self.other.noise <= self.one.noise
+        return bool(self.other.noise <= self.one.noise)
 
     def row(self) -> dict[str, Any]:
         """All figures, for JSON."""
