@@ -263,7 +263,7 @@ def signal_to_noise(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance) -> flo
 def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
     """(..., C) mean electrons of the sensor's channels, at most a full well."""
     light = radiance_cd_m2.astype(np.float64)
-    if frame.sensor.color == "mono":
+    if frame.is_monochrome:
         light = light @ MONO_WEIGHTS.T.astype(np.float64)
     electrons: Array = np.clip(light * frame.sensor.electrons_per_cd_m2(frame.exposure), 0.0, frame.sensor.full_well_e)
     return electrons

@@ -17,6 +17,7 @@ from drogue_models.surroundings.hose_look import HoseLook
 from drogue_models.tankers.tanker import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
+from scenes.camera_sampling import camera_of_scene
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
@@ -95,6 +96,7 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
         "hose": family.hose,
         "receiver": family.receiver,
         "neighbours": family.neighbours,
+        "camera": family.camera,
     }
     return recipe.model_copy(update=changes)
 
@@ -133,7 +135,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     pose = kinematics.left_from_drogue
     if kinematics.sequence_id is not None:
         environment = _environment_of_sequence(environment, kinematics)
-    rig, sensor = scene_recipe.rig, scene_recipe.sensor
+    rig = scene_recipe.rig
+    sensor, camera = camera_of_scene(scene_recipe, scene_id)
     exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
     condition = None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue)
     neighbours = neighbours_of_frame(
@@ -164,6 +167,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         sensor=sensor,
         exposure=exposure,
         environment=environment,
+        camera=camera,
         rangefinder_reading_m=_rangefinder_reading_m(scene_recipe, frame_index, pose),
         loss=kinematics.loss,
     )

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.recipe.camera_ranges import CameraRanges
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.recipe.hose_ranges import HoseRanges
@@ -30,7 +31,7 @@ from drogue_models.untrusted_files import parse_toml, read_text
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
-_OPTIONAL_FAMILY_SECTIONS = ("tanker", "hose", "receiver", "neighbours")
+_OPTIONAL_FAMILY_SECTIONS = ("tanker", "hose", "receiver", "neighbours", "camera")
 
 
 def fill_families(table: dict[str, Any]) -> None:
@@ -127,8 +128,8 @@ class Family(FrozenModel):
     Attributes:
         name: stored in the frames of its scenes.
         weight: its share of the scenes, relative to the other families' weights.
-        pose, target, environment, exposure, tanker, hose, receiver, neighbours: as in `Recipe`; in TOML only the keys
-            that differ from the recipe's.
+        pose, target, environment, exposure, tanker, hose, receiver, neighbours, camera: as in `Recipe`; in TOML only
+            the keys that differ from the recipe's.
     """
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -141,6 +142,7 @@ class Family(FrozenModel):
     hose: HoseRanges | None = Field(default=None, exclude_if=lambda hose: hose is None)
     receiver: ReceiverRanges | None = Field(default=None, exclude_if=lambda receiver: receiver is None)
     neighbours: NeighbourRanges | None = Field(default=None, exclude_if=lambda neighbours: neighbours is None)
+    camera: CameraRanges | None = Field(default=None, exclude_if=lambda camera: camera is None)
 
 
 class Recipe(FrozenModel):
@@ -160,6 +162,7 @@ class Recipe(FrozenModel):
         hose: length, hang and paint of the hoses, or none for one length in the drogue's paint.
         receiver: its probe, and what else of it is in view, or none for what `target.probe` says.
         neighbours: other drogues in view, or none.
+        camera: flaws, processing and coding of the pictures, or none for the sensor's own.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -186,6 +189,7 @@ class Recipe(FrozenModel):
     hose: HoseRanges | None = Field(default=None, exclude_if=lambda hose: hose is None)
     receiver: ReceiverRanges | None = Field(default=None, exclude_if=lambda receiver: receiver is None)
     neighbours: NeighbourRanges | None = Field(default=None, exclude_if=lambda neighbours: neighbours is None)
+    camera: CameraRanges | None = Field(default=None, exclude_if=lambda camera: camera is None)
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
@@ -242,6 +246,18 @@ class Recipe(FrozenModel):
             raise ValueError("board: takes the drogue's place; set frames.empty_fraction to 1, and give no families")
         if self.pose.speed_m_s != 0 or self.pose.rate_deg_s != 0:
             raise ValueError("board: stands still; set pose.speed_m_s and pose.rate_deg_s to 0")
+        return self
+
+    @model_validator(mode="after")
+    def _pictures_are_of_one_kind(self) -> Self:
+        parts: tuple[Recipe | Family, ...] = (self, *self.families)
+        if any(part.camera is not None for part in parts) and (
+            self.sensor.encoding != "gamma" or self.sensor.output_bits != 8
+        ):
+            raise ValueError(
+                'camera: gives pictures of 8 bits for screens; set rig.encoding to "gamma" and rig.output_bits to 8, '
+                f"got {self.sensor.encoding} and {self.sensor.output_bits}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -11,6 +11,7 @@ from datasets_manifest.types.appearance import DrogueCondition, Obstacle, Placed
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
 from datasets_manifest.types.neighbours import OtherDrogue
+from datasets_manifest.types.video_camera import VideoCamera
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import MAX_NEIGHBOURS
@@ -123,6 +124,7 @@ class FrameSpec(FrozenModel):
         hose_look: paint of the hose, or None for the drogue's structural paint.
         neighbours: other drogues in view, none of which is sought.
         rig, sensor, exposure, environment: as named.
+        camera: what the pictures go through besides the sensor, or None for nothing.
         rangefinder_reading_m: measured distance of the rim centre along the optical axis, or None without one. [m]
         loss: kind of the dropout whose onset, middle or end this frame is in, or None.
     """
@@ -154,6 +156,7 @@ class FrameSpec(FrozenModel):
     sensor: Sensor
     exposure: Exposure
     environment: Environment
+    camera: VideoCamera | None = Field(default=None, exclude_if=lambda camera: camera is None)
     rangefinder_reading_m: float | None = Field(default=None, exclude_if=lambda reading_m: reading_m is None)
     loss: DropoutKind | None = Field(default=None, exclude_if=lambda loss: loss is None)
 
@@ -171,6 +174,11 @@ class FrameSpec(FrozenModel):
         if self.drogue is not None and states and len(states) != self.drogue.marker_count:
             raise ValueError(f"condition.markers: must be {self.drogue.marker_count} or none, got {len(states)}")
         return self
+
+    @property
+    def is_monochrome(self) -> bool:
+        """Whether the sensor measures one band."""
+        return self.sensor.color == "mono" or (self.camera is not None and self.camera.spectrum != "colour")
 
     def sought_and_neighbours(self) -> tuple[FrameSpec, ...]:
         """The frame as it is, then once for each neighbour with that as its drogue and no others."""

@@ -54,3 +54,26 @@ class StereoImages:
     def size_px(self) -> tuple[int, int]:
         """(width, height). [px]"""
         return int(self.left.shape[1]), int(self.left.shape[0])
+
+
+def srgb_from_light(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Level on the sRGB curve (IEC 61966-2-1) of linear light, both in [0, 1]."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055)
+
+
+def light_from_srgb(level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear light of a level on the sRGB curve (IEC 61966-2-1), both in [0, 1]."""
+    return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+
+
+def display_table(
+    encoding: Literal["linear", "gamma"], bits: int, black_level_dn: float, display_bits: Literal[8, 16] = 8
+) -> Pixels:
+    """(2^bits,) pixel value for a screen, on the sRGB curve and 0 at the black level, by pixel value."""
+    codes, black = np.arange(2**bits) / (2**bits - 1), np.array(black_level_dn / (2**bits - 1))
+    if encoding == "gamma":
+        codes, black = light_from_srgb(codes), light_from_srgb(black)
+    light = np.clip((codes - black) / (1 - black), 0, 1)
+    levels = np.round((2**display_bits - 1) * srgb_from_light(light))
+    table: Pixels = levels.astype(np.uint8 if display_bits == 8 else np.uint16)
+    return table

@@ -37,6 +37,12 @@ def tanker_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
     )
 
 
+def airframe_size_m(tanker: Tanker) -> Array:
+    """(3,) length, span and height of the airframe. [m]"""
+    mesh, _ = _airframe_mesh(tanker.type, tanker.flaps_deg)
+    return np.asarray(mesh.extents)
+
+
 # A map takes 25 MB, and frames of one scene follow each other or are far apart.
 @lru_cache(maxsize=3)
 def _fixed_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:

@@ -76,6 +76,11 @@ class ExportLog:
         if count:
             self._losses[what] += count
 
+    def remark(self, line: str) -> None:
+        """Add a remark once."""
+        if line not in self.remarks:
+            self.remarks.append(line)
+
     @property
     def losses(self) -> dict[str, int]:
         """Counts by reason, sorted by name."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.images import Pixels, StereoImages
+from datasets_manifest.types.images import Pixels, StereoImages, display_table
 from geometry.se3 import Array
 from geometry.stereo import Eye
 from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
@@ -119,20 +119,7 @@ def _display_encoded(image: Pixels, images: StereoImages) -> NDArray[np.uint8]:
     """The image in 8 bits, encoded by the sRGB curve (IEC 61966-2-1), 0 at the black level."""
     if images.encoding == "gamma" and images.bits == 8 and images.black_level_dn == 0:
         return image.astype(np.uint8, copy=False)
-    codes = np.arange(2**images.bits) / (2**images.bits - 1)
-    black = np.array(images.black_level_dn / (2**images.bits - 1))
-    if images.encoding == "gamma":
-        codes, black = _srgb_to_light(codes), _srgb_to_light(black)
-    light = np.clip((codes - black) / (1 - black), 0, 1)
-    table = np.round(255 * _light_to_srgb(light)).astype(np.uint8)
+    table = display_table(images.encoding, images.bits, images.black_level_dn)
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, table), dtype=np.uint8)
     return np.take(table, image, mode="clip")
-
-
-def _srgb_to_light(code: Array) -> Array:
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-
-
-def _light_to_srgb(light: Array) -> Array:
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

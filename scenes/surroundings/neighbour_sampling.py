@@ -14,6 +14,7 @@ from datasets_manifest.types.appearance import DrogueCondition
 from datasets_manifest.types.neighbours import OtherDrogue
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tankers.tanker import Tanker
+from drogue_models.tankers.tanker_surfaces import airframe_size_m
 from drogue_models.tankers.wing_with_pod import pod_exit_m
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
@@ -75,7 +76,7 @@ def neighbours_of_frame(
     hoses = recipe.hose or HoseRanges()
     hose = hose_of_scene(recipe.seed, _SECOND_HOSE + scene_id, hoses, drogue)
     rng = frame_generator(recipe.seed, frame_index, "neighbour")
-    first = _Formation(recipe, kinematics.left_from_drogue, kinematics.left_from_tanker, drogue)
+    first = _Formation(recipe, kinematics.left_from_drogue, kinematics.left_from_tanker, kind)
     # Only under the plain wing is there room for another pod.
     is_same = rng.random() < ranges.same_tanker_fraction and kind.tanker is None
     hanging = _hung(rng, hoses, hose, drogue)
@@ -131,10 +132,11 @@ class _Formation:
         recipe: Recipe,
         left_from_drogue: RigidTransform,
         left_from_tanker: RigidTransform,
-        drogue: DrogueParameters,
+        kind: NeighbourKind,
     ) -> None:
-        self._rig, self._drogue = recipe.rig, drogue
+        self._rig, self._drogue = recipe.rig, kind.drogue
         self._sought, self._tanker = left_from_drogue, left_from_tanker
+        self._airframe_m = None if kind.tanker is None else airframe_size_m(kind.tanker)
 
     def at_other_station(
         self, rng: np.random.Generator, ranges: NeighbourRanges, hanging: tuple[RigidTransform, Array]
@@ -159,10 +161,17 @@ class _Formation:
             depth_m = sample_uniform(rng, ranges.distance_fraction) * float(self._sought.translation_m[2])
             place_m = sample_point_in_view(rng, self._rig, depth_m)
             exit_m = place_m - self._tanker.rotation @ hanging[0].translation_m
-            if self._fits(place_m, ranges):
+            if self._fits(place_m, ranges) and self._is_clear(exit_m):
                 pose = RigidTransform(self._tanker.rotation, exit_m)
                 return pose, pose
         return None, None
+
+    def _is_clear(self, exit_m: Array) -> bool:
+        """Whether a second airframe of the same heading there has a box that is clear of the first one's."""
+        if self._airframe_m is None:
+            return True
+        away_m = self._tanker.rotation.T @ (exit_m - self._tanker.translation_m)
+        return bool((np.abs(away_m) > self._airframe_m).any())
 
     def _fits(self, place_m: Array, ranges: NeighbourRanges) -> bool:
         """Whether both eyes see all of a drogue there, and none of it behind the sought one."""

@@ -17,6 +17,16 @@ def test_every_recipe_can_be_read_and_carries_its_name(name: str) -> None:
     assert recipe.description
 
 
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_says_what_its_pictures_are_for(name: str) -> None:
+    source = load_recipe(name)
+    recipe = source.recipe
+    says = "linear, for measuring" if recipe.sensor.encoding == "linear" else "sRGB, for looking and training"
+    if any(part.camera is not None for part in (recipe, *recipe.families)):
+        says = "drawn cameras, for looking and training"
+    assert f"# Pictures: {says}." in source.text.splitlines()
+
+
 @pytest.mark.parametrize(("name", "markers"), [("semi-physical-5", 5), ("semi-physical-7", 7)])
 def test_semi_physical_has_100_sets_at_stations_1_m_apart(name: str, markers: int) -> None:
     recipe = load_recipe(name).recipe

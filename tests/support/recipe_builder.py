@@ -46,6 +46,7 @@ class RecipeTable(TypedDict, total=False):
     hose: Section
     receiver: Section
     neighbours: Section
+    camera: Section
 
 
 # The ideal eyes with an eighth and a quarter of their pixels a side, at the same field of view.

@@ -31,7 +31,9 @@ def export(
     image_bits: Annotated[
         int | None,
         typer.Option(
-            metavar="8|16", help="With --images: bits of copies of 12-bit images; 8 by default.", show_default=False
+            metavar="8|16",
+            help="With --images: 8, the default, for copies that viewers show right; 16 keeps the sensor's values.",
+            show_default=False,
         ),
     ] = None,
     estimates: Annotated[

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.images import StereoImages, display_table
 from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 
 Picture = NDArray[np.uint8]
@@ -32,12 +32,8 @@ _FARTHEST_PX = 1e6
 
 def display_picture(images: StereoImages) -> Picture:
     """(H, W, 3) left image in sRGB, for a screen."""
-    span = 2**images.bits - 1 - images.black_level_dn
-    level = np.clip((images.left.astype(np.float32) - images.black_level_dn) / span, 0, 1)
-    if images.encoding == "linear":
-        # IEC 61966-2-1, the sRGB curve.
-        level = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
-    picture = np.rint(255 * level).astype(np.uint8)
+    table = display_table(images.encoding, images.bits, images.black_level_dn)
+    picture = np.take(table, images.left, mode="clip").astype(np.uint8)
     return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
 
 

@@ -122,7 +122,7 @@ def _write(
     files |= {split: f"{own}{split}.json" for split in ("train", "val", "test") if split in splits.values()}
     header = canonical_json(coco_header(source.manifest, with_features))
     count = keypoint_count(source.manifest)
-    bits = source.manifest.recipe.sensor.output_bits
+    sensor = source.manifest.recipe.sensor
     with ExitStack() as stack:
         writers = {name: _CocoFile(stack, target, file, header) for name, file in files.items()}
         for record in log.records(source):
@@ -142,8 +142,15 @@ def _write(
                 if images is not None:
                     copy = images.folder / _copy_name(record, eye, split, "all")
                     export_image(source, record.frame_index, eye, copy, log, images.bits)
-                elif bits > 8:
-                    log.lost(f"images of {bits} bits in 16, nearly black to programs for 8: add --images for copies")
+                elif sensor.output_bits > 8:
+                    log.lost(
+                        f"images of {sensor.output_bits} bits in 16, nearly black to programs for 8: add --images for "
+                        "copies"
+                    )
+                elif sensor.encoding == "linear":
+                    log.remark(
+                        "the named images are linear, dark to viewers: add --images for copies on the sRGB curve"
+                    )
                 masked = None if drogue is None else objects if part_id is not None else 0
                 log_missing_labels(log, record, eye, masked)
         for writer in writers.values():

@@ -25,6 +25,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
 from labelgen.export.export_log import ExportLog
+from labelgen.export.frame_files import DISPLAY_REMARK
 from labelgen.export.packages.huggingface_columns import HubColumn, arrow_type, hub_columns, hub_row, yaml_feature
 
 SHARD_BYTES = 500_000_000
@@ -79,8 +80,10 @@ def write_huggingface(dataset: Location, out: Path, log: ExportLog, shard_bytes:
         (folder / CALIBRATION_FOLDER).mkdir()
         for name, text in calibration_files(manifest.recipe.rig).items():
             (folder / CALIBRATION_FOLDER / name).write_text(text, encoding="utf-8", newline="\n")
-    bits = manifest.recipe.sensor.output_bits
-    if bits > 8:
+    bits, is_linear = manifest.recipe.sensor.output_bits, manifest.recipe.sensor.encoding == "linear"
+    if is_linear:
+        log.remark(DISPLAY_REMARK)
+    elif bits > 8:
         log.remarks.append(f"of {bits}-bit images all bits are in the files, moved to the top of 16")
     if bits > 8 and manifest.recipe.sensor.color != "mono":
         log.remarks.append("Pillow, which `datasets` uses, reads the upper 8 bits of colour images; the card says more")
@@ -254,10 +257,19 @@ def _notes(manifest: Manifest) -> list[str]:
         notes.append(
             'Depth is a column of bytes: `pairs.cast_column("left_depth_m", datasets.Image())` decodes it to metres.'
         )
-    if sensor.output_bits > 8:
+    if sensor.encoding == "linear":
+        samples = 8 if sensor.output_bits == 8 else 16
+        notes.append(
+            f"The sensor is linear. Images are encoded for screens, in {samples} bits: sRGB (IEC 61966-2-1), 0 at the "
+            "black level."
+        )
+    kept = [] if sensor.encoding == "linear" else ["Images"]
+    kept += ["Mosaics"] if sensor.color == "bayer" else []
+    if sensor.output_bits > 8 and kept:
         low = 16 - sensor.output_bits
         notes.append(
-            f"Images have {sensor.output_bits} bits at the top of 16: shift values right by {low} to get them."
+            f"{' and '.join(kept).capitalize()} have {sensor.output_bits} bits at the top of 16: shift values right by "
+            f"{low} to get them."
         )
     if sensor.output_bits > 8 and sensor.color != "mono":
         notes.append(

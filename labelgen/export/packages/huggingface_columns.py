@@ -30,7 +30,7 @@ from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.annotated_views import annotated_objects
 from labelgen.export.annotations.coco import coco_feature_id, coco_image_id
 from labelgen.export.export_log import ExportLog
-from labelgen.export.frame_files import full_range_png
+from labelgen.export.frame_files import display_png, full_range_png
 from labelgen.export.keypoints import view_keypoints, view_of
 
 Feature = dict[str, Any]
@@ -94,7 +94,8 @@ def hub_columns(manifest: Manifest) -> dict[str, HubColumn]:
         "split": HubColumn(TEXT, "`train`, `val` or `test`"),
         "time_s": HubColumn(NUMBER, "mid-exposure [s]"),
     }
-    columns |= _by_eye("image", PICTURE, "what the camera saw")
+    seen = "what the camera saw"
+    columns |= _by_eye("image", PICTURE, f"{seen}, on the sRGB curve" if recipe.sensor.encoding == "linear" else seen)
     if recipe.sensor.color == "bayer":
         columns |= _by_eye("mosaic", PICTURE, "raw RGGB mosaic")
     columns |= _by_eye("parts", PICTURE, "part id of every pixel, listed below; null where the dataset has none")
@@ -123,7 +124,9 @@ def hub_columns(manifest: Manifest) -> dict[str, HubColumn]:
         **columns,
         "conditions": HubColumn(conditions, "by which reports group pairs"),
         "exposure": HubColumn({"time_s": NUMBER, "f_number": NUMBER, "gain": NUMBER}, "of both eyes"),
-        "image_black_level_dn": HubColumn(NUMBER, "pixel value without light, in steps of the sensor's own bits"),
+        "image_black_level_dn": HubColumn(
+            NUMBER, "pixel value of the images without light, in steps of the sensor's own bits"
+        ),
         "record": HubColumn(TEXT, "the whole record as JSON"),
     }
 
@@ -184,11 +187,11 @@ def hub_row(source: Dataset, record: PairRecord, split: str, log: ExportLog) -> 
         "left_from_drogue": None if record.left_from_drogue is None else _pose(record.left_from_drogue),
         "conditions": record.conditions.model_dump(include={"family", *_CONDITIONS, *_NOISES}),
         "exposure": record.frame.exposure.model_dump(include={"time_s", "f_number", "gain"}),
-        "image_black_level_dn": record.image_black_level_dn,
+        "image_black_level_dn": 0.0 if recipe.sensor.encoding == "linear" else record.image_black_level_dn,
         "record": canonical_json(record.model_dump(mode="json")),
     }
     for eye in EYES:
-        row[f"{eye}_image"] = _picture(full_range_png(source, index, image_file(eye)), index, image_file(eye))
+        row[f"{eye}_image"] = _picture(_shown_png(source, index, image_file(eye)), index, image_file(eye))
         if recipe.sensor.color == "bayer":
             mosaic = full_range_png(source, index, mosaic_file(eye))
             row[f"{eye}_mosaic"] = _picture(mosaic, index, mosaic_file(eye))
@@ -200,6 +203,14 @@ def hub_row(source: Dataset, record: PairRecord, split: str, log: ExportLog) -> 
         row[f"{eye}_keypoints"] = _keypoints(record, eye)
         row[f"{eye}_camera"] = _camera(record, eye)
     return row
+
+
+def _shown_png(source: Dataset, frame_index: int, name: str) -> bytes:
+    """An image as viewers expect it: linear ones on the sRGB curve, with 16 bits where the sensor has more than 8."""
+    sensor = source.manifest.recipe.sensor
+    if sensor.encoding == "linear":
+        return display_png(source, frame_index, name, 8 if sensor.output_bits == 8 else 16)
+    return full_range_png(source, frame_index, name)
 
 
 def _picture(data: bytes, frame_index: int, name: str) -> dict[str, Any]:

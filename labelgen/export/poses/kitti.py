@@ -23,7 +23,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, require_pinholes
-from labelgen.export.frame_files import export_image
+from labelgen.export.frame_files import export_measured_image
 from labelgen.export.keypoints import log_cut_labels, view_of
 from labelgen.part_pixels import drogue_hull_m
 
@@ -66,7 +66,9 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             _write_lines(training / "calib" / f"{name}.txt", calibration)
             for eye in EYES:
                 number = _NUMBER_OF_EYE[eye]
-                export_image(source, record.frame_index, eye, training / f"image_{number}" / f"{name}.png", log)
+                export_measured_image(
+                    source, record.frame_index, eye, training / f"image_{number}" / f"{name}.png", log
+                )
                 label = kitti_label(record, eye)
                 _write_lines(training / f"label_{number}" / f"{name}.txt", [] if label is None else [label])
                 log_cut_labels(log, record, eye)

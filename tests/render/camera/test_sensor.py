@@ -8,7 +8,8 @@ from scipy.special import ndtr
 
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.types.frame import Exposure, FrameSpec
-from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose, normal_quantiles
+from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose
+from render.camera.sensor_readout import normal_quantiles
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import paper_view_recipe

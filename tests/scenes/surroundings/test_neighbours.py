@@ -9,6 +9,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from scenes.flight.suspension import hose_tail_m
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import RecipeTable, between, build_recipe
@@ -75,6 +76,26 @@ def test_its_hose_leads_from_the_coupling_to_a_tanker(frames: list[FrameSpec]) -
             else:
                 station = frame.left_from_tanker.inverse().apply(nodes[-1])
                 assert 3 <= abs(station[1]) <= 12
+
+
+def test_a_second_aircraft_does_not_touch_the_first() -> None:
+    drawn = build_recipe(
+        BASE,
+        tanker={"variants": [{"type": "twin-jet-wide"}]},
+        neighbours={"scene_fraction": 1.0, "distance_fraction": [1.2, 8]},
+    )
+    seen = 0
+    for index in range(6):
+        frame = sample_frame(drawn, index)
+        for other in frame.neighbours:
+            assert frame.tanker is not None
+            assert frame.left_from_tanker is not None and other.left_from_tanker is not None
+            vertices = tanker_surfaces(frame.tanker)[0].mesh.vertices
+            away_m = frame.left_from_tanker.inverse().apply(other.left_from_tanker.translation_m)
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            assert ((low + away_m > high) | (high + away_m < low)).any()
+            seen += 1
+    assert seen >= 2
 
 
 def test_stations_of_the_same_tanker_are_used_where_they_are_in_view() -> None:

@@ -15,7 +15,9 @@ from datasets_manifest.storage.reader import Dataset
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
+from labelgen.export.frame_files import DISPLAY_REMARK
 from labelgen.export.keypoints import view_of
+from tests.support.display_encoding import shown
 from tests.support.other_python import read_by
 
 READ_BY_DATUMARO = """
@@ -71,8 +73,20 @@ def test_every_named_image_lies_in_the_moved_folder(with_images: Path, mixed_dat
             own = image["droguekit"]
             pixels = cv2.imread(str(folder / image["file_name"]))
             stored = getattr(source.images(own["frame_index"]), own["view"])
-            np.testing.assert_array_equal(pixels[:, :, ::-1], stored)
+            np.testing.assert_array_equal(pixels[:, :, ::-1], shown(stored, source, own["frame_index"]))
     moved.rename(with_images)
+
+
+def test_images_for_screens_are_linked_and_linear_ones_keep_their_values_only_when_asked(
+    dataset_by_preset: Callable[..., Path], tmp_path: Path
+) -> None:
+    log = ExportLog()
+    for encoding, bits, is_same in (("gamma", 8, True), ("linear", 8, False), ("linear", 16, True)):
+        dataset, out = dataset_by_preset("rgb-ideal", {"encoding": encoding}), tmp_path / f"{encoding}-{bits}"
+        write_export("coco", dataset, out, log, image_bits=bits)
+        copy = next((out / "images").rglob("000001_right.png")).read_bytes()
+        assert (copy == (dataset / "frames" / "000001" / "right.png").read_bytes()) == is_same
+    assert log.remarks == [DISPLAY_REMARK]
 
 
 def test_deep_images_are_told_of_and_copied_with_eight_bits(
@@ -84,12 +98,13 @@ def test_deep_images_are_told_of_and_copied_with_eight_bits(
     assert log.losses["images of 12 bits in 16, nearly black to programs for 8: add --images for copies"] == 6
     log = ExportLog()
     write_export("coco", dataset, tmp_path / "with", log, image_bits=8)
-    assert log.losses["images of 12 bits: written with their upper 8"] == 6
+    assert log.losses["images of 12 bits: written with 8, on the sRGB curve"] == 6
     source = Dataset(dataset)
     for image in json.loads((tmp_path / "with" / "annotations" / "all.json").read_text())["images"]:
         copy = cv2.imread(str(tmp_path / "with" / "images" / image["file_name"]), cv2.IMREAD_UNCHANGED)
         own = image["droguekit"]
-        np.testing.assert_array_equal(copy, getattr(source.images(own["frame_index"]), own["view"]) // 16)
+        stored = getattr(source.images(own["frame_index"]), own["view"])
+        np.testing.assert_array_equal(copy, shown(stored, source, own["frame_index"]))
         assert copy.dtype == np.uint8
 
 
@@ -119,7 +134,7 @@ def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(
         copy = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         stored = getattr(source.images(image["droguekit"]["frame_index"]), image["droguekit"]["view"])
         np.testing.assert_array_equal((copy if channels == 1 else copy[:, :, ::-1]) >> 4, stored)
-        # A reader of 8 bits sees what the copies of 8 bits show.
+        # A reader of 8 bits sees the upper ones.
         np.testing.assert_array_equal(cv2.imread(str(path))[:, :, 0], (copy if channels == 1 else copy[:, :, 0]) >> 8)
 
 

@@ -18,6 +18,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
+from tests.support.display_encoding import shown
 from tests.support.other_python import read_by
 
 NAMES = ("yolo", "yolo-image-order", "yolo-detect")
@@ -82,7 +83,8 @@ def test_images_and_labels_go_together(name: str, exports: dict[str, Path], mixe
     for record, eye, _, _ in views(mixed_dataset):
         place = f"{splits[record.frame_index]}/{record.frame_index:06d}_{eye}"
         image = exports[name] / "images" / f"{place}.png"
-        assert image.read_bytes() == (mixed_dataset / f"frames/{record.frame_index:06d}/{eye}.png").read_bytes()
+        stored = cv2.imread(str(mixed_dataset / f"frames/{record.frame_index:06d}/{eye}.png"))
+        np.testing.assert_array_equal(cv2.imread(str(image)), shown(stored, Dataset(mixed_dataset), record.frame_index))
         assert (exports[name] / "labels" / f"{place}.txt").is_file()
     assert len(list(exports[name].rglob("*.txt"))) == len(list(exports[name].rglob("*.png"))) == 18
 
@@ -168,11 +170,13 @@ def test_twelve_bits_become_eight_and_are_told(dataset_by_preset: Callable[..., 
     dataset = dataset_by_preset("mono", {"output_bits": 12})
     log = ExportLog()
     write_export("yolo", dataset, tmp_path / "out", log)
-    assert log.losses["images of 12 bits: written with their upper 8"] == 6
+    assert log.losses["images of 12 bits: written with 8, on the sRGB curve"] == 6
     for path in (tmp_path / "out").rglob("*.png"):
         index, eye = path.stem.split("_")
         whole = cv2.imread(str(dataset / "frames" / index / f"{eye}.png"), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), whole // 16)
+        np.testing.assert_array_equal(
+            cv2.imread(str(path), cv2.IMREAD_UNCHANGED), shown(whole, Dataset(dataset), int(index))
+        )
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -27,6 +27,7 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
 from labelgen.export.packages.huggingface import write_huggingface
+from tests.support.display_encoding import shown
 from tests.support.other_python import read_by
 from tests.support.small_datasets import docking_recipe, rendered
 from tests.support.whole_dataset import write_whole_dataset
@@ -132,7 +133,9 @@ def test_rows_hold_the_images_and_records_of_all_pairs(mixed_dataset: Path, tmp_
         assert json.loads(row["record"]) == json.loads((folder / "record.json").read_text())
         assert row["split"] == splits[row["frame_index"]]
         for eye in EYES:
-            assert row[f"{eye}_image"]["bytes"] == (folder / f"{eye}.png").read_bytes()
+            seen = cv2.imdecode(np.frombuffer(row[f"{eye}_image"]["bytes"], np.uint8), cv2.IMREAD_COLOR)
+            stored = cv2.imread(str(folder / f"{eye}.png"))
+            np.testing.assert_array_equal(seen, shown(stored, source, row["frame_index"]))
             assert row[f"{eye}_image"]["path"] == f"{row['frame_index']:06d}_{eye}.png"
             assert row[f"{eye}_parts"]["bytes"] == (folder / f"{eye}_parts.png").read_bytes()
 
@@ -210,9 +213,18 @@ def test_all_bits_of_deep_images_are_in_the_files(
         for name, pixels in wanted.items():
             seen = cv2.imdecode(np.frombuffer(row[name]["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
             assert seen.dtype == np.uint16 and seen.max() > 4095
-            np.testing.assert_array_equal(seen[..., ::-1] >> 4 if seen.ndim == 3 else seen >> 4, pixels)
+            seen = seen[..., ::-1] if seen.ndim == 3 else seen
+            if name.endswith("_mosaic"):
+                np.testing.assert_array_equal(seen >> 4, pixels)
+                continue
+            np.testing.assert_array_equal(seen, shown(pixels, source, row["frame_index"], levels=65535))
+            # Values above the black level of 64 stay apart.
+            light = pixels[pixels >= 64]
+            assert len(np.unique(seen[pixels >= 64])) == len(np.unique(light))
+        assert row["image_black_level_dn"] == 0.0
     notes = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
-    assert "shift values right by 4" in notes
+    assert "The sensor is linear. Images are encoded for screens, in 16 bits" in notes
+    assert ("Mosaics have 12 bits at the top of 16: shift values right by 4" in notes) == (preset == "paper-colour")
     assert ("decode=False" in notes) == (preset != "mono") == any("upper 8 bits" in line for line in log.remarks)
 
 
@@ -260,7 +272,7 @@ def test_datasets_reads_everything(mixed_export: Path, mixed_dataset: Path, tmp_
             assert HUB_SPLITS[splits[index]] == split
             images = source.images(index)
             for eye, pixels in (("left", images.left), ("right", images.right)):
-                assert row[f"{eye}_image"] == told_of(pixels, "RGB")
+                assert row[f"{eye}_image"] == told_of(shown(pixels, source, index), "RGB")
                 assert row[f"{eye}_parts"] == told_of(source.part_ids(index, eye), "L")
             plain = [name for name in row if not name.endswith(("_image", "_parts")) and name != "file"]
             assert {name: row[name] for name in plain} == {name: by_pyarrow[index][name] for name in plain}
@@ -277,10 +289,10 @@ def test_datasets_gives_all_bits_of_deep_images(
     told, source = read_by("datasets", READ_BY_DATASETS, tmp_path / "out", folder=tmp_path), Dataset(dataset)
     for row in (row for rows in told["rows"].values() for row in rows):
         pixels = source.images(row["frame_index"]).left
-        whole = (pixels << 4 | pixels >> 8).astype(np.uint16)
+        whole = shown(pixels, source, row["frame_index"], levels=65535)
         # Pillow has no colour images of 16 bits.
-        shown = told_of(whole, "I;16") if preset == "mono" else told_of((whole >> 8).astype(np.uint8), "RGB")
-        assert row["left_image"] == shown
+        wanted = told_of(whole, "I;16") if preset == "mono" else told_of((whole >> 8).astype(np.uint8), "RGB")
+        assert row["left_image"] == wanted
         seen = cv2.imdecode(np.frombuffer(base64.b64decode(row["file"]), np.uint8), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(seen[..., ::-1] if seen.ndim == 3 else seen, whole)
 

@@ -13,12 +13,14 @@ import trimesh
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_passes
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
 from labelgen.export.poses.bop import depth_numbers, write_bop
+from tests.support.display_encoding import shown
 from tests.support.drawn_pairs import Pair
 from tests.support.recipe_builder import build_recipe, stations
 
@@ -219,7 +221,8 @@ def test_images_empty_frames_and_targets(bop: Path, pairs: list[Pair], deep_data
         scene, index = scene_of(bop, pair), pair.frame.frame_index
         for eye in EYES:
             image = scene / f"rgb_{eye}" / f"{index:06d}.png"
-            assert image.read_bytes() == (deep_dataset / "frames" / f"{index:06d}" / f"{eye}.png").read_bytes()
+            stored = cv2.imread(str(deep_dataset / "frames" / f"{index:06d}" / f"{eye}.png"))
+            np.testing.assert_array_equal(cv2.imread(str(image)), shown(stored, Dataset(deep_dataset), index))
             count = 0 if pair.frame.drogue is None else 1
             assert len(table_of(bop, pair, "scene_gt", eye)) == len(table_of(bop, pair, "scene_gt_info", eye)) == count
         if pair.frame.drogue is not None and SPLITS[pair.frame.scene_id % 3] == "test":

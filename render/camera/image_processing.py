@@ -1,0 +1,176 @@
+"""A camera's image processor: from the raw numbers of a sensor to a picture of 8 bits for screens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.images import srgb_from_light
+from datasets_manifest.types.video_camera import ImageProcessing
+from render.camera.sensor_readout import compiled
+
+Plane = NDArray[np.float32]
+_GREY_CARD = 0.18
+_TOP = 255.0
+
+
+def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessing) -> NDArray[np.uint8]:
+    """A picture of raw numbers.
+
+    Tones and white balance come first, then denoising and sharpening of luma and a blur of chroma, as in Rec. 601.
+
+    Args:
+        raw: (H, W) of an RGGB mosaic, or of a monochrome camera.
+        frame: gives sensor, exposure and camera.
+        processing: as named.
+
+    Returns:
+        (H, W, 3), or (H, W) of a monochrome camera.
+    """
+    tables = tone_tables(processing, frame.sensor.adc_bits, frame.sensor.black_level_dn)
+    threshold = processing.denoise_threshold * noise_levels(frame, processing)
+    detail = np.array(
+        [processing.kept_detail_fraction, 1.0 + processing.sharpen, max(threshold, 1e-3) ** 2], dtype=np.float32
+    )
+    if frame.is_monochrome:
+        luma = tables[1][raw]
+        grey = np.empty(raw.shape, np.uint8)
+        _finish_grey(luma, _blurred(luma, processing.denoise_sigma_px), detail, grey)
+        return grey
+    code = cv2.COLOR_BayerRGGB2RGB_EA if processing.demosaic == "edge-aware" else cv2.COLOR_BayerRGGB2RGB
+    linear = cv2.cvtColor(raw, code)
+    luma, blue, red = (np.empty(raw.shape, np.float32) for _ in range(3))
+    _split(linear, tables, np.float32(processing.saturation), luma, blue, red)
+    picture = np.empty(linear.shape, np.uint8)
+    blue, red = (_blurred_chroma(plane, processing.chroma_blur_px) for plane in (blue, red))
+    _finish(luma, _blurred(luma, processing.denoise_sigma_px), blue, red, detail, picture)
+    return picture
+
+
+def metered(processing: ImageProcessing, frame: FrameSpec, raw: Sequence[NDArray[np.uint16]]) -> ImageProcessing:
+    """The processing of a pair: with a smaller exposure factor where the view is brighter than it may be.
+
+    Args:
+        processing: of the scene.
+        frame: gives the sensor.
+        raw: numbers of both eyes.
+    """
+    black, top = frame.sensor.black_level_dn, 2**frame.sensor.adc_bits - 1
+    mean = (sum(cv2.mean(numbers)[0] for numbers in raw) / len(raw) - black) / (top - black)
+    limit = processing.brightest_mean_fraction
+    factor = processing.exposure_factor
+    if factor * mean / (1.0 + (factor - 1.0) * mean) <= limit:
+        return processing
+    # Below a twentieth nothing would be left of a picture that is white all over.
+    factor = max(limit * (1.0 - mean) / (mean * (1.0 - limit)), 0.06)
+    return processing.model_copy(update={"exposure_factor": float(factor)})
+
+
+def noise_levels(frame: FrameSpec, processing: ImageProcessing) -> float:
+    """Standard deviation of shot and read noise where the picture is mid-grey, before denoising. [of 255 levels]"""
+    sensor = frame.sensor
+    tables = tone_tables(processing, sensor.adc_bits, sensor.black_level_dn)
+    factor = processing.exposure_factor
+    grey = _GREY_CARD / (factor - (factor - 1.0) * _GREY_CARD)
+    full_e = sensor.full_well_e / frame.exposure.gain
+    noise = np.sqrt(grey * full_e + sensor.read_noise_e**2) / full_e
+    span = 2**sensor.adc_bits - 1 - sensor.black_level_dn
+    low, high = np.interp(
+        sensor.black_level_dn + span * np.array([grey - noise, grey + noise]), np.arange(2**sensor.adc_bits), tables[1]
+    )
+    return float(high - low) / 2.0
+
+
+@lru_cache(maxsize=8)
+def tone_tables(processing: ImageProcessing, adc_bits: int, black_level_dn: int) -> Plane:
+    """(3, 2^bits) level of 255 in red, green and blue by raw number.
+
+    The signal x becomes f x / (1 + (f - 1) x): slope f at black, and white stays white. Then come the sRGB curve
+    (IEC 61966-2-1), a share of the smoothstep 3 y^2 - 2 y^3 as contrast, and the level of black.
+    """
+    red, blue = processing.white_balance
+    gains = np.array([red, 1.0, blue])
+    # The least gain is 1: a clipped highlight stays white.
+    gains = gains[:, None] / gains.min()
+    number = np.arange(2**adc_bits, dtype=np.float64)
+    signal = np.clip(gains * (number - black_level_dn) / (2**adc_bits - 1 - black_level_dn), 0.0, 1.0)
+    factor = processing.exposure_factor
+    level = srgb_from_light(factor * signal / (1.0 + (factor - 1.0) * signal))
+    level += processing.contrast * (level * level * (3.0 - 2.0 * level) - level)
+    level = processing.black_fraction + (1.0 - processing.black_fraction) * level
+    tables: Plane = (_TOP * np.clip(level, 0.0, 1.0)).astype(np.float32)
+    tables.flags.writeable = False
+    return tables
+
+
+def _blurred(plane: Plane, sigma_px: float) -> Plane:
+    result: Plane = cv2.GaussianBlur(plane, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101)
+    return result
+
+
+def _blurred_chroma(plane: Plane, sigma_px: float) -> Plane:
+    """Chroma at half the resolution, blurred, and enlarged again, corner to corner."""
+    height, width = plane.shape
+    half = cv2.resize(plane, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA)
+    if sigma_px > 0:
+        half = cv2.GaussianBlur(half, (0, 0), sigma_px / 2.0, borderType=cv2.BORDER_REFLECT_101)
+    result: Plane = cv2.resize(half, (width, height), interpolation=cv2.INTER_LINEAR)
+    return result
+
+
+@compiled
+def _split(
+    linear: NDArray[np.uint16], tables: Plane, saturation: np.float32, luma: Plane, blue: Plane, red: Plane
+) -> None:
+    """Fill in luma and the differences B - Y and R - Y of a picture of raw numbers."""
+    height, width = luma.shape
+    for row in range(height):
+        for column in range(width):
+            r = tables[0, linear[row, column, 0]]
+            g = tables[1, linear[row, column, 1]]
+            b = tables[2, linear[row, column, 2]]
+            y = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
+            luma[row, column] = y
+            blue[row, column] = saturation * (b - y)
+            red[row, column] = saturation * (r - y)
+
+
+@compiled
+def _clean(level: np.float32, smooth: np.float32, detail: Plane) -> np.float32:
+    """Luma with faint detail reduced and distinct detail amplified."""
+    kept, sharp, threshold = detail
+    fine = level - smooth
+    share = fine * fine / (fine * fine + threshold)
+    return np.float32(smooth + fine * (kept + (sharp - kept) * share))
+
+
+@compiled
+def _finish(luma: Plane, smooth: Plane, blue: Plane, red: Plane, detail: Plane, picture: NDArray[np.uint8]) -> None:
+    """Fill in the picture."""
+    height, width = luma.shape
+    low, top, half = np.float32(0.0), np.float32(255.0), np.float32(0.5)
+    for row in range(height):
+        for column in range(width):
+            y = _clean(luma[row, column], smooth[row, column], detail)
+            r, b = y + red[row, column], y + blue[row, column]
+            # Rec. 601: Y = 0.299 R + 0.587 G + 0.114 B.
+            g = y - np.float32(0.299 / 0.587) * red[row, column] - np.float32(0.114 / 0.587) * blue[row, column]
+            picture[row, column, 0] = np.uint8(min(max(r, low), top) + half)
+            picture[row, column, 1] = np.uint8(min(max(g, low), top) + half)
+            picture[row, column, 2] = np.uint8(min(max(b, low), top) + half)
+
+
+@compiled
+def _finish_grey(luma: Plane, smooth: Plane, detail: Plane, picture: NDArray[np.uint8]) -> None:
+    """Fill in a monochrome picture."""
+    height, width = luma.shape
+    low, top, half = np.float32(0.0), np.float32(255.0), np.float32(0.5)
+    for row in range(height):
+        for column in range(width):
+            y = _clean(luma[row, column], smooth[row, column], detail)
+            picture[row, column] = np.uint8(min(max(y, low), top) + half)
