@@ -114,6 +114,7 @@ def _sample_processing(
     return ImageProcessing(
         demosaic="edge-aware" if rng.random() < 0.7 else "bilinear",
         white_balance=(float(red), float(blue)),
+        neutral_fraction=sample_uniform(rng, ranges.neutral_fraction),
         exposure_factor=float(np.clip(factor * 2.0 ** sample_uniform(rng, ranges.exposure_ev), 0.06, 20.0)),
         brightest_mean_fraction=sample_uniform(rng, ranges.brightest_mean_fraction),
         contrast=sample_uniform(rng, ranges.contrast),

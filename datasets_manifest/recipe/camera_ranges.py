@@ -30,6 +30,7 @@ class CameraRanges(FrozenModel):
         ghost_scene_fraction: share of scenes whose lens has ghosts of a sun in or near the view.
         window_scene_fraction: share of scenes behind a window with dirt, scratches, drops or reflections.
         white_balance_fraction: largest error of red and blue, either way.
+        neutral_fraction: see `ImageProcessing`.
         exposure_ev: error of the exposure. [powers of 2]
         brightest_mean_fraction, contrast, black_fraction, saturation, denoise_sigma_px, kept_detail_fraction,
             denoise_threshold, sharpen, chroma_blur_px: see `ImageProcessing`.
@@ -52,6 +53,7 @@ class CameraRanges(FrozenModel):
     ghost_scene_fraction: Fraction = 0.5
     window_scene_fraction: Fraction = 0.25
     white_balance_fraction: float = Field(default=0.06, ge=0, le=0.5)
+    neutral_fraction: Range = Range(low=0.1, high=0.6)
     exposure_ev: Range = Range(low=-0.5, high=0.4)
     brightest_mean_fraction: Range = Range(low=0.2, high=0.4)
     contrast: Range = Range(low=-0.1, high=0.4)
@@ -79,6 +81,7 @@ class CameraRanges(FrozenModel):
             ("vignetting_fraction", 0, 0.99),
             ("scattered_fraction", 0, 0.5),
             ("bloom_fraction", 0, 0.5),
+            ("neutral_fraction", 0, 1),
             ("exposure_ev", -3, 3),
             ("brightest_mean_fraction", 0.02, 1),
             ("contrast", -0.5, 1),

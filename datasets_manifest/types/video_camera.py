@@ -56,6 +56,8 @@ class ImageProcessing(FrozenModel):
     Attributes:
         demosaic: how the mosaic is interpolated.
         white_balance: (red, blue) wrong factors on the channels.
+        neutral_fraction: how far the camera takes the mean colour of the view to grey: 0 not at all, 1 completely, on a
+            logarithmic scale.
         exposure_factor: on the signal before the tone curve, whose slope at black it is; white stays white.
         brightest_mean_fraction: linear level that the mean of both eyes' pictures may reach; a brighter view gets a
             smaller exposure factor.
@@ -71,6 +73,7 @@ class ImageProcessing(FrozenModel):
 
     demosaic: Literal["bilinear", "edge-aware"] = "edge-aware"
     white_balance: tuple[float, float] = (1.0, 1.0)
+    neutral_fraction: Fraction = 0.0
     exposure_factor: float = Field(default=1.0, gt=0.05, le=20)
     brightest_mean_fraction: float = Field(default=1.0, gt=0.01, le=1)
     contrast: float = Field(default=0.0, ge=-0.5, le=1)

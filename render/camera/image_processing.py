@@ -17,6 +17,8 @@ from render.camera.sensor_readout import compiled
 Plane = NDArray[np.float32]
 _GREY_CARD = 0.18
 _TOP = 255.0
+# Cameras know the colours that daylight and lamps have, and correct no others.
+_MOST_GAIN = 1.6
 
 
 def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessing) -> NDArray[np.uint8]:
@@ -53,22 +55,28 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
 
 
 def metered(processing: ImageProcessing, frame: FrameSpec, raw: Sequence[NDArray[np.uint16]]) -> ImageProcessing:
-    """The processing of a pair: with a smaller exposure factor where the view is brighter than it may be.
+    """The processing of a pair: whiter light where the view has a colour, less exposure where it is too bright.
 
     Args:
         processing: of the scene.
         frame: gives the sensor.
-        raw: numbers of both eyes.
+        raw: numbers of both eyes, (H, W) each.
     """
     black, top = frame.sensor.black_level_dn, 2**frame.sensor.adc_bits - 1
-    mean = (sum(cv2.mean(numbers)[0] for numbers in raw) / len(raw) - black) / (top - black)
-    limit = processing.brightest_mean_fraction
-    factor = processing.exposure_factor
-    if factor * mean / (1.0 + (factor - 1.0) * mean) <= limit:
-        return processing
-    # Below a twentieth nothing would be left of a picture that is white all over.
-    factor = max(limit * (1.0 - mean) / (mean * (1.0 - limit)), 0.06)
-    return processing.model_copy(update={"exposure_factor": float(factor)})
+    # By rows and columns of the mosaic: red, two greens, blue.
+    sites = np.array([[numbers[row::2, column::2].mean() for numbers in raw] for row in (0, 1) for column in (0, 1)])
+    red, green_1, green_2, blue = np.maximum((sites.mean(axis=1) - black) / (top - black), 1e-6)
+    green, mean = (green_1 + green_2) / 2.0, float(np.mean([red, green_1, green_2, blue]))
+    changes: dict[str, object] = {}
+    if processing.neutral_fraction > 0 and not frame.is_monochrome:
+        toward_grey = np.array([green / red, green / blue]) ** processing.neutral_fraction
+        gains = np.clip(toward_grey, 1.0 / _MOST_GAIN, _MOST_GAIN) * processing.white_balance
+        changes["white_balance"] = (float(gains[0]), float(gains[1]))
+    limit, factor = processing.brightest_mean_fraction, processing.exposure_factor
+    if factor * mean / (1.0 + (factor - 1.0) * mean) > limit:
+        # Below a twentieth nothing would be left of a picture that is white all over.
+        changes["exposure_factor"] = max(limit * (1.0 - mean) / (mean * (1.0 - limit)), 0.06)
+    return processing.model_copy(update=changes)
 
 
 def noise_levels(frame: FrameSpec, processing: ImageProcessing) -> float:

@@ -258,12 +258,24 @@ def test_a_flat_colour_keeps_its_colour(frame: FrameSpec) -> None:
     np.testing.assert_allclose(drawn[20:-20, 20:-20].mean(axis=(0, 1)), plain, atol=1.0)
 
 
-@pytest.mark.parametrize("level", [0.2, 0.7])
+@pytest.mark.parametrize("level", [0.1, 0.7])
 def test_a_bright_view_is_shown_no_brighter_than_asked(frame: FrameSpec, level: float) -> None:
     camera = VideoCamera(processing=ImageProcessing(exposure_factor=1.8, brightest_mean_fraction=0.3))
     shown = expose(with_camera(frame, camera), pair_of(flat_light(level), frame)).left[..., 1].mean() / 255
     wanted = 0.3 if level == 0.7 else 1.8 * level / (1 + 0.8 * level)
     assert light_from_srgb(np.array(shown)) == pytest.approx(wanted, rel=0.02)
+
+
+def test_the_colour_of_a_view_is_taken_as_far_to_grey_as_asked(frame: FrameSpec) -> None:
+    pair = pair_of(flat_light(0.2), frame)
+    tint = np.array([1.2, 1.0, 0.8], np.float32)
+    coloured = EyeRadiance(**{**vars(pair.left), "radiance_cd_m2": pair.left.radiance_cd_m2 * tint})
+    light = StereoRadiance(**{**vars(pair), "left": coloured, "right": coloured})
+    for share in (0.0, 0.5, 1.0):
+        camera = VideoCamera(processing=ImageProcessing(neutral_fraction=share))
+        shown = expose(with_camera(frame, camera), light).left[20:-20, 20:-20].mean(axis=(0, 1)) / 255
+        linear = light_from_srgb(shown)
+        np.testing.assert_allclose(linear / linear[1], tint ** (1.0 - share), rtol=0.02)
 
 
 def test_infrared_darkens_the_sky_brightens_leaves_and_leaves_grey() -> None:
