@@ -116,6 +116,7 @@ def usage_over_frames() -> list[Usage] | None:
     return usage
 
 
+@pytest.mark.slow  # 60 frames
 def test_kernels_and_memory_settle_over_the_frames_of_a_varied_recipe() -> None:
     usage = run_in_own_process(usage_over_frames)
     if usage is None:
