@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
+from scenes.ground_view import FARTHEST_M
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.photometry import Radiance, hemisphere, henyey_greenstein
 
@@ -59,7 +60,7 @@ class LayeredAir:
     @cached_property
     def ground_illuminance_lux(self) -> NDArray[np.float64]:
         """(3,) mean illuminance of level ground under all layers. [lux]"""
-        result: NDArray[np.float64] = self._open_level_lux * _transmitted_share(self._environment.clouds)
+        result: NDArray[np.float64] = self._open_level_lux * transmitted_share(self._environment.clouds)
         if self._environment.mist is not None:
             mist = self._environment.mist
             result /= 1.0 + BACK_SCATTER * mist.extinction_per_m * (mist.above_m + mist.below_m)
@@ -69,12 +70,15 @@ class LayeredAir:
     def ground_beam_lux(self) -> NDArray[np.float64]:
         """(3,) mean illuminance, over cloud and gaps, of a plane on the ground that faces the beam. [lux]"""
         beam, mist = self._sky.beam, self._environment.mist
-        share = _direct_share(self._environment.clouds)
+        share = direct_share(self._environment.clouds)
         if mist is not None:
             depth = mist.extinction_per_m * (mist.above_m + mist.below_m)
             share *= float(np.exp(-depth / max(float(beam.direction[2]), _LOWEST_BEAM_SINE)))
-        result: NDArray[np.float64] = share * beam.beam_illuminance_lux()
+        result: NDArray[np.float64] = share * self._beam_on_ground_lux()
         return result
+
+    def _beam_on_ground_lux(self) -> NDArray[np.float64]:
+        return self._sky.beam.beam_illuminance_lux()
 
     @cached_property
     def beam_illuminance_lux(self) -> NDArray[np.float64]:
@@ -105,22 +109,22 @@ class LayeredAir:
         height_m = layer.height_above_camera_m
         above = tuple(other for other in environment.clouds if other.height_above_camera_m > height_m)
         below = tuple(other for other in environment.clouds if other.height_above_camera_m < height_m)
-        direct_share, through = _direct_share(above), _transmitted_share(above)
-        spread = np.maximum(through - direct_share, 0.0) * self._open_level_lux
+        direct, through = direct_share(above), transmitted_share(above)
+        spread = np.maximum(through - direct, 0.0) * self._open_level_lux
         falling = through * self._open_level_lux
         ground = np.array(environment.ground_reflectance_rgb) * self.ground_illuminance_lux
         return CloudLight(
             direction=beam.direction,
-            beam_lux=direct_share * beam.beam_illuminance_lux(max(environment.altitude_m + height_m, 0.0)),
-            sky_lux=direct_share * self.sky_level_lux + spread,
-            ground_lux=ground + falling * (1.0 - _transmitted_share(below)),
+            beam_lux=direct * beam.beam_illuminance_lux(max(environment.altitude_m + height_m, 0.0)),
+            sky_lux=direct * self.sky_level_lux + spread,
+            ground_lux=ground + falling * (1.0 - transmitted_share(below)),
         )
 
     @cached_property
     def _under_deck(self) -> tuple[float, NDArray[np.float64]]:
         """Share of the sky that clouds above the camera leave open, and airlight under the rest. [cd/m2]"""
         above = tuple(layer for layer in self._environment.clouds if layer.is_above)
-        return _direct_share(above), _AIR_UNDER_DECK / np.pi * _transmitted_share(above) * self._open_level_lux
+        return direct_share(above), _AIR_UNDER_DECK / np.pi * transmitted_share(above) * self._open_level_lux
 
     def sky_and_air(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
         """Clear sky behind the haze, and infinitely deep air, without mist.
@@ -139,13 +143,59 @@ class LayeredAir:
         horizon = self._sky.radiance(flat)
         # Below this elevation the air path hardly grows: kept constant there, sky and air meet without a seam.
         sky = np.where((np.asarray(directions)[..., 2] < np.sin(HORIZON_ELEVATION_RAD))[..., None], horizon, sky)
-        direct_share, under_deck = self._under_deck
-        if direct_share == 1.0:
+        open_share, under_deck = self._under_deck
+        if open_share == 1.0:
             return sky, horizon
-        air = (direct_share * horizon + (1.0 - direct_share) * under_deck).astype(np.float32)
+        air = (open_share * horizon + (1.0 - open_share) * under_deck).astype(np.float32)
         up = np.maximum(np.asarray(directions)[..., 2], 1e-4)
         hidden = 1.0 - np.exp(-self._environment.extinction_per_m * _HAZE_SCALE_M / up)
         return sky + hidden[..., None].astype(np.float32) * (air - horizon), air
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the air around the camera, without mist. [1/m]"""
+        return self._environment.extinction_per_m
+
+    @property
+    def highest_ground_sine(self) -> float:
+        """Sine of the elevation of the horizon."""
+        return 0.0
+
+    def horizon_share(self, directions: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
+        """(...) share of each pixel that lies below the horizon; pixels are `angle_rad` wide."""
+        return (directions[..., 2] < 0).astype(np.float32)
+
+    def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """(..., 3) radiance of infinitely deep air along (..., 3) unit directions. [cd/m2]"""
+        return self.sky_and_air(directions)[1]
+
+    def before_ground(self, ground: Radiance, directions: NDArray[np.float32], air: Radiance) -> Radiance:
+        """Ground behind the air in front of it, in place.
+
+        Args:
+            ground: (H, W, 3) its radiance. [cd/m2]
+            directions: (H, W, 3) unit vectors in world axes.
+            air: (H, W, 3) the second result of `sky_and_air`. [cd/m2]
+        """
+        altitude_m = np.float32(self._environment.altitude_m)
+        distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
+        clear = np.exp(-distance_m * np.float32(self._environment.extinction_per_m))[..., None]
+        ground -= air
+        ground *= clear
+        ground += air
+        return ground
+
+    def before_cloud(
+        self,
+        light: Radiance,
+        directions: NDArray[np.float32],
+        distance_m: NDArray[np.float32],
+        air: Radiance,
+    ) -> Radiance:
+        """(H, W, 3) light of clouds behind the air up to their distances; arguments as in `before_ground`. [cd/m2]"""
+        clear = np.exp(distance_m * np.float32(-self._environment.extinction_per_m))[..., None]
+        result: Radiance = air + clear * (light - air)
+        return result
 
     def mist_light(self, directions: NDArray[np.floating[Any]]) -> Radiance:
         """(..., 3) radiance of infinitely deep mist along (..., 3) unit directions. [cd/m2]"""
@@ -153,7 +203,7 @@ class LayeredAir:
         assert mist is not None
         above = tuple(layer for layer in self._environment.clouds if layer.is_above)
         depth = BACK_SCATTER * mist.extinction_per_m * mist.above_m
-        even = _AIR_IN_MIST / np.pi * _transmitted_share(above) * self._open_level_lux / (1.0 + depth)
+        even = _AIR_IN_MIST / np.pi * transmitted_share(above) * self._open_level_lux / (1.0 + depth)
         cosine = np.einsum("...i,i->...", directions, self._sky.beam.direction)
         peak = henyey_greenstein(cosine, _DROPLET_ASYMMETRY)[..., None] * self.beam_illuminance_lux
         result: Radiance = (even + peak).astype(np.float32)
@@ -169,12 +219,12 @@ class LayeredAir:
         return opacity
 
 
-def _transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
+def transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
     """Share of light that the layers transmit, direct or scattered."""
     return float(np.prod([diffuse_transmission(layer) for layer in layers])) if layers else 1.0
 
 
-def _direct_share(layers: tuple[CloudLayer, ...]) -> float:
+def direct_share(layers: tuple[CloudLayer, ...]) -> float:
     """Mean share of light that the layers transmit directly."""
     shares = [1.0 - layer.cover_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
     return float(np.prod(shares)) if shares else 1.0

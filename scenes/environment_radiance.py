@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
+from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
 from scenes.clouds.cloud_layers import band_limited, render_cloud_layer
 from scenes.clouds.ray_march import upsample
 from scenes.ground.ground_radiance import Ground
 from scenes.ground.sea import GroundLight
-from scenes.ground_view import FARTHEST_M, pixel_angle_rad
+from scenes.ground_view import pixel_angle_rad
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.photometry import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
@@ -40,8 +41,12 @@ class EnvironmentRadiance:
 
     def __init__(self, environment: Environment) -> None:
         self.environment = environment
-        self.sky = ClearSky(environment)
-        self.air = LayeredAir(environment, self.sky)
+        if environment.sky_model == "scattering":
+            self.sky: ClearSky = ScatteringSky(environment)
+            self.air: LayeredAir = ScatteringAir(environment, self.sky)
+        else:
+            self.sky = ClearSky(environment)
+            self.air = LayeredAir(environment, self.sky)
 
     def moved_to(self, environment: Environment) -> EnvironmentRadiance:
         """The same environment for a camera elsewhere.
@@ -89,7 +94,7 @@ class EnvironmentRadiance:
         pictures = [
             self._cloud(layer, directions[rows], horizon[rows]) for layer, rows in zip(layers, parts, strict=True)
         ]
-        rows = _rows_with(directions[..., 2] < 0)
+        rows = _rows_with(directions[..., 2] < self._ground_below(directions))
         uncovered = np.ones(directions.shape[:2], dtype=np.float32)
         for layer, part, picture in zip(layers, parts, pictures, strict=True):
             if not layer.is_above:
@@ -121,7 +126,7 @@ class EnvironmentRadiance:
     def extinction_per_m(self) -> float:
         """Extinction coefficient of air and mist around the camera. [1/m]"""
         mist = self.environment.mist
-        return self.environment.extinction_per_m + (mist.extinction_per_m if mist is not None else 0.0)
+        return self.air.extinction_per_m + (mist.extinction_per_m if mist is not None else 0.0)
 
     def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
         """Radiance of infinitely deep air and mist, into which distant objects fade.
@@ -132,7 +137,7 @@ class EnvironmentRadiance:
         Returns:
             (..., 3) radiance. [cd/m2]
         """
-        _, air = self.air.sky_and_air(directions)
+        air = self.air.airlight(directions)
         if self.environment.mist is None:
             return air
         droplets = self.environment.mist.extinction_per_m / self.extinction_per_m
@@ -150,7 +155,13 @@ class EnvironmentRadiance:
         beam_lux, to_beam = self.air.ground_beam_lux, self.beam_direction
         sky_lux = np.maximum(self.ground_illuminance_lux - beam_lux * max(float(to_beam[2]), 0.0), 0.0)
         light = GroundLight(sky_lux=sky_lux, beam_direction=to_beam, beam_lux=beam_lux, sky_radiance=self.radiance)
-        return Ground(self.environment, light)
+        clear = self.air.ground_clear if isinstance(self.air, ScatteringAir) else None
+        return Ground(self.environment, light, clear)
+
+    def _ground_below(self, directions: NDArray[np.float32]) -> float:
+        """Vertical component below which pixels show some ground."""
+        horizon = self.air.highest_ground_sine
+        return min(horizon + pixel_angle_rad(directions), 0.0) if horizon < 0 else 0.0
 
     def _put_ground(
         self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
@@ -158,18 +169,15 @@ class EnvironmentRadiance:
         """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` is its visible share."""
         if directions.size == 0:
             return
-        altitude_m = np.float32(self.environment.altitude_m)
-        distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
-        clear = np.exp(-distance_m * np.float32(self.environment.extinction_per_m))[..., None]
-        seen = self.ground.radiance(directions, uncovered)
-        seen -= horizon
-        seen *= clear
-        seen += horizon
-        below = directions[..., 2] < 0
-        whole = below.all(axis=1)
+        seen = self.air.before_ground(self.ground.radiance(directions, uncovered), directions, horizon)
+        share = self.air.horizon_share(directions, pixel_angle_rad(directions))
+        whole = (share == 1.0).all(axis=1)
         # Whole rows at once where possible: a masked copy takes as long as everything before.
         total[whole] = seen[whole]
-        np.copyto(total, seen, where=(below & ~whole[:, None])[..., None])
+        np.copyto(total, seen, where=((share == 1.0) & ~whole[:, None])[..., None])
+        mixed = (share > 0.0) & (share < 1.0)
+        if mixed.any():
+            total[mixed] += share[mixed][:, None] * (seen[mixed] - total[mixed])
 
     def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
         """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity."""
@@ -179,8 +187,7 @@ class EnvironmentRadiance:
         every = _CLOUD_STEP_PX if many else 1
         chosen, behind_air = directions[::every, ::every], air[::every, ::every]
         seen = render_cloud_layer(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
-        clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
-        light = behind_air + clear * (seen.radiance - behind_air)
+        light = self.air.before_cloud(seen.radiance, chosen, seen.distance_m, behind_air)
         # Light times opacity is interpolated, because light is undefined where there is no cloud.
         layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
         if not many:
@@ -268,6 +275,11 @@ class MappedEnvironmentRadiance(EnvironmentRadiance):
     def beam_illuminance_lux(self) -> NDArray[np.float64]:
         """(3,) illuminance of a plane that faces the map's sun; zeros when it has none. [lux]"""
         return self._light.sun_lux
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the air around the camera. [1/m]"""
+        return self.environment.extinction_per_m
 
     @property
     def ground_illuminance_lux(self) -> NDArray[np.float64]:

@@ -61,6 +61,7 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
         clouds=tuple(layer for layer in layers if layer is not None),
         mist=sample_mist(frame_generator(seed, scene_id, "mist"), ranges.mist),
         moon=sample_moon(frame_generator(seed, scene_id, "moon"), ranges.moon),
+        sky_model=ranges.sky_model,
     )
     return (
         environment if ranges.map is None else _mapped(environment, ranges.map, frame_generator(seed, scene_id, "map"))

@@ -19,6 +19,8 @@ FARTHEST_M = 4e5  # beyond this distance haze hides everything
 # A piece seen at a grazing angle is elongated; it is averaged over at most so many points along its length.
 _MOST_PLACES = 5
 _NARROWEST_RAD = 1e-5
+_EARTH_M = 6.371e6
+_LEAST_SINE = 0.002
 
 
 def power_noise(seed: int, stream: str, size_px: int, slope: float, cycles: float) -> Field:
@@ -182,7 +184,11 @@ def pixel_angle_rad(directions: NDArray[np.float32]) -> float:
 
 
 def ground_view(
-    directions: NDArray[np.float32], altitude_m: float, angle_rad: float, offset_m: tuple[float, float] = (0.0, 0.0)
+    directions: NDArray[np.float32],
+    altitude_m: float,
+    angle_rad: float,
+    offset_m: tuple[float, float] = (0.0, 0.0),
+    is_round: bool = False,
 ) -> GroundView:
     """The ground along rays; rays that miss it see its farthest edge.
 
@@ -191,9 +197,13 @@ def ground_view(
         altitude_m: of the camera. [m]
         angle_rad: between neighbouring rays. [rad]
         offset_m: of the camera, east and north of the ground's origin. [m]
+        is_round: whether the ground curves as the Earth does, instead of going on level.
     """
-    sine = np.maximum(-directions[..., 2], np.float32(altitude_m / FARTHEST_M))
-    distance_m = np.float32(altitude_m) / sine
+    if is_round:
+        distance_m, sine = _round_ground(directions[..., 2], altitude_m)
+    else:
+        sine = np.maximum(-directions[..., 2], np.float32(altitude_m / FARTHEST_M))
+        distance_m = np.float32(altitude_m) / sine
     level = np.maximum(np.hypot(directions[..., 0], directions[..., 1]), np.float32(1e-6))
     across_m = distance_m * np.float32(angle_rad)
     stretch = 1.0 / float(sine.mean())
@@ -207,3 +217,15 @@ def ground_view(
         along_m=across_m / sine,
         places=int(np.clip(np.ceil(stretch / 5.0), 1, _MOST_PLACES)),
     )
+
+
+def _round_ground(up: Field, altitude_m: float) -> tuple[Field, Field]:
+    """Distance to a round Earth along rays [m], and sine of the angle at which they meet it; at most to the horizon."""
+    radius_m = _EARTH_M + altitude_m
+    falls_m = -up.astype(np.float64) * radius_m
+    square = altitude_m * (2.0 * _EARTH_M + altitude_m)
+    root = np.sqrt(np.maximum(falls_m * falls_m - square, 0.0))
+    distance_m = np.minimum(square / np.maximum(falls_m + root, 1.0), np.sqrt(square))
+    # The cosine theorem at the place where the ray ends.
+    sine = np.maximum((square - distance_m * distance_m) / (2.0 * _EARTH_M * distance_m), _LEAST_SINE)
+    return distance_m.astype(np.float32), sine.astype(np.float32)

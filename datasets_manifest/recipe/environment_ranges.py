@@ -6,7 +6,7 @@ from typing import Self
 
 from pydantic import Field, field_validator, model_validator
 
-from datasets_manifest.types.environment import CloudKind, EnvironmentMapFile, GroundKind
+from datasets_manifest.types.environment import CloudKind, EnvironmentMapFile, GroundKind, SkyModel
 from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
 
@@ -110,6 +110,7 @@ class EnvironmentRanges(FrozenModel):
         mist, moon: with the share of the scenes that have them.
         map: an image of sky and ground, which replaces all of the above but the visibility; in TOML the path of a file
             in absolute units, or a table with `file` and the other keys of `EnvironmentMapRanges`.
+        sky_model: see `Environment`; not drawn.
     """
 
     sun_elevation_deg: Range = Range(low=15, high=65)
@@ -123,6 +124,7 @@ class EnvironmentRanges(FrozenModel):
     mist: MistRanges = MistRanges()
     moon: MoonRanges = MoonRanges()
     map: EnvironmentMapRanges | None = None
+    sky_model: SkyModel = Field(default="daylight", exclude_if=lambda model: model == "daylight")
 
     @field_validator("ground", mode="before")
     @classmethod
@@ -142,4 +144,6 @@ class EnvironmentRanges(FrozenModel):
         self.visibility_m.within(500, 400_000, "visibility_m")
         self.altitude_m.within(10, 20_000, "altitude_m")
         self.wind_speed_m_s.within(0, 40, "wind_speed_m_s")
+        if self.map is not None and self.sky_model != "daylight":
+            raise ValueError("sky_model: a map replaces the sky; leave out one of the two")
         return self

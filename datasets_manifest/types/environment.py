@@ -17,6 +17,8 @@ GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town"]
 
 GROUND_KINDS: tuple[GroundKind, ...] = get_args(GroundKind)
 
+SkyModel = Literal["daylight", "scattering"]
+
 Turbulence = Literal["none", "light", "moderate", "severe"]
 
 MIN_AIRSPEED_M_S = 5.0
@@ -153,6 +155,9 @@ class Environment(FrozenModel):
         mist: thin cloud around the camera, or none.
         moon: or none.
         map: an image of sky and ground that replaces all of the above but the visibility, or none.
+        sky_model: `daylight` is Preetham's sky, with twilight after measurements, over air of one density and level
+            ground; `scattering` follows light through a round atmosphere that thins out with height, and there
+            `visibility_m` is that of the air at the ground.
     """
 
     sun_elevation_deg: float = Field(ge=-90, le=90)
@@ -170,10 +175,12 @@ class Environment(FrozenModel):
     mist: Mist | None = None
     moon: Moon | None = None
     map: EnvironmentMap | None = None
+    # Left out at its default, as above.
+    sky_model: SkyModel = Field(default="daylight", exclude_if=lambda model: model == "daylight")
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient of the clear air, without mist (Koschmieder, contrast 2 %). [1/m]"""
+        """Extinction coefficient that the visibility stands for, without mist (Koschmieder, contrast 2 %). [1/m]"""
         return 3.912 / self.visibility_m
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -86,10 +88,18 @@ class Ground:
     Args:
         environment: gives kind, colour and seed of the ground, altitude and wind.
         light: on the ground.
+        clear: transmittance of the air in front of the ground, by the sine of the depression of rays; None for air that
+            is as dense everywhere as the visibility says.
     """
 
-    def __init__(self, environment: Environment, light: GroundLight) -> None:
+    def __init__(
+        self,
+        environment: Environment,
+        light: GroundLight,
+        clear: Callable[[NDArray[np.floating[Any]]], NDArray[np.floating[Any]]] | None = None,
+    ) -> None:
         self._environment = environment
+        self._clear = clear or self._even_air
         self._light = light
         self._kind = environment.ground
         rng = frame_generator(environment.ground_texture_seed, 0, "ground")
@@ -115,8 +125,7 @@ class Ground:
         total = np.empty(directions.shape, dtype=np.float32)
         every = _STEP_PX if directions.shape[0] * directions.shape[1] >= _MANY_RAYS else 1
         regions, shapes = self._smooth_fields(directions, every, angle_rad)
-        nearest_m = self._environment.altitude_m / np.maximum(-directions[..., 2].min(axis=1), 1e-6)
-        clear = np.exp(-self._environment.extinction_per_m * nearest_m)
+        clear = self._clear(-directions[..., 2].min(axis=1))
         for first in range(0, directions.shape[0], _BLOCK_ROWS):
             rows = slice(first, first + _BLOCK_ROWS)
             if clear[rows].max() < _HIDDEN:
@@ -136,6 +145,11 @@ class Ground:
                 total[block] = seen if step == 1 else upsample(seen, step, (height, width))
         return total
 
+    def _even_air(self, sine: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+        distance_m = self._environment.altitude_m / np.maximum(sine, 1e-6)
+        clear: NDArray[np.floating[Any]] = np.exp(-self._environment.extinction_per_m * distance_m)
+        return clear
+
     def moved_to(self, environment: Environment) -> Ground:
         """The same ground for a camera elsewhere at the same altitude.
 
@@ -148,7 +162,8 @@ class Ground:
 
     def _view(self, directions: NDArray[np.float32], angle_rad: float) -> GroundView:
         environment = self._environment
-        return ground_view(directions, environment.altitude_m, angle_rad, environment.camera_offset_m)
+        is_round = environment.sky_model == "scattering"
+        return ground_view(directions, environment.altitude_m, angle_rad, environment.camera_offset_m, is_round)
 
     @property
     def _mean_radiance(self) -> NDArray[np.float32]:

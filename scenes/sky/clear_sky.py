@@ -70,9 +70,9 @@ class Luminary:
         if day < 1 and elevation_deg > _NIGHT_BELOW_DEG:
             self._skies.append(((1.0 - day) * brighter, TwilightSky(turbidity, elevation_deg, azimuth_deg)))
 
-    def beam_illuminance_lux(self, height_m: float = 0.0) -> NDArray[np.float64]:
+    def beam_illuminance_lux(self, height_m: float | None = None) -> NDArray[np.float64]:
         """(3,) illuminance of a plane that faces it, by channel; at greater heights it sets later. [lux]"""
-        dip_deg = float(np.degrees(np.sqrt(2.0 * max(height_m, 0.0) / 6.371e6)))
+        dip_deg = float(np.degrees(np.sqrt(2.0 * max(height_m or 0.0, 0.0) / 6.371e6)))
         through = beam_transmission(self._elevation_deg + dip_deg, self._turbidity)
         result: NDArray[np.float64] = SOLAR_ILLUMINANCE_LUX * self._share * through
         return result
@@ -97,26 +97,23 @@ class ClearSky:
     def __init__(self, environment: Environment) -> None:
         self._moon = environment.moon
         self._sun_azimuth_deg = environment.sun_azimuth_deg
-        turbidity = environment.turbidity
-        self.sun = Luminary(
-            environment.sun_elevation_deg,
-            environment.sun_azimuth_deg,
-            turbidity,
-            SOLAR_ILLUMINANCE_LUX,
-            environment.altitude_m,
+        self.sun = self._luminary(
+            environment, environment.sun_elevation_deg, environment.sun_azimuth_deg, SOLAR_ILLUMINANCE_LUX
         )
         self.moon: Luminary | None = None
         if environment.moon is not None:
-            self.moon = Luminary(
-                environment.moon.elevation_deg,
-                environment.moon.azimuth_deg,
-                turbidity,
-                moon_illuminance_lux(environment.moon.phase_angle_deg),
-                environment.altitude_m,
+            moon = environment.moon
+            self.moon = self._luminary(
+                environment, moon.elevation_deg, moon.azimuth_deg, moon_illuminance_lux(moon.phase_angle_deg)
             )
         self.beam = self.sun
         if self.moon is not None and self.moon.beam_illuminance_lux().sum() > self.sun.beam_illuminance_lux().sum():
             self.beam = self.moon
+
+    def _luminary(
+        self, environment: Environment, elevation_deg: float, azimuth_deg: float, illuminance_lux: float
+    ) -> Luminary:
+        return Luminary(elevation_deg, azimuth_deg, environment.turbidity, illuminance_lux, environment.altitude_m)
 
     @property
     def sun_direction(self) -> NDArray[np.float64]:
@@ -155,15 +152,24 @@ class ClearSky:
             if luminary is None:
                 continue
             cosine = np.einsum("...i,i->...", directions, luminary.direction.astype(np.float32))
-            disc = (cosine > np.cos(SUN_RADIUS_RAD)) & (directions[..., 2] > 0)
+            disc = (cosine > np.cos(SUN_RADIUS_RAD)) & self._visible(directions)
             if not disc.any():
                 continue
             lit, area_sr = np.ones(int(disc.sum()), dtype=bool), SUN_SOLID_ANGLE_SR
             if luminary is self.moon and self._moon is not None:
                 lit = self._lit_moon(directions[disc])
                 area_sr *= 0.5 * (1.0 + np.cos(np.radians(self._moon.phase_angle_deg)))
-            share = luminary.beam_illuminance_lux() * through / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
+            share = self._disc_lux(luminary, directions[disc]) * through / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
             radiance[disc] += lit[:, None] * share.astype(np.float32)
+
+    def _visible(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(...) which directions no ground hides."""
+        above: NDArray[np.bool_] = directions[..., 2] > 0
+        return above
+
+    def _disc_lux(self, luminary: Luminary, directions: NDArray[np.float32]) -> NDArray[np.floating[Any]]:
+        """(3,) or (..., 3) illuminance by the light that comes through the disc at directions. [lux]"""
+        return luminary.beam_illuminance_lux()
 
     def _lit_moon(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(N,) which (N, 3) directions within the moon's disc hit its lit side."""
