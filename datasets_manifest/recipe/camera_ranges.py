@@ -45,7 +45,7 @@ class CameraRanges(FrozenModel):
     grey_scene_fraction: Fraction = 0.08
     near_infrared_scene_fraction: Fraction = 0.04
     full_well_fraction: Range = Range(low=0.2, high=1.0)
-    psf_sigma_px: Range = Range(low=0.45, high=1.1)
+    psf_sigma_px: Range = Range(low=0.4, high=0.9)
     vignetting_fraction: Range = Range(low=0.0, high=0.35)
     scattered_fraction: Range = Range(low=0.005, high=0.05)
     lateral_color_px: float = Field(default=1.2, ge=0, le=10)
@@ -59,15 +59,15 @@ class CameraRanges(FrozenModel):
     contrast: Range = Range(low=-0.1, high=0.4)
     black_fraction: Range = Range(low=-0.02, high=0.04)
     saturation: Range = Range(low=0.7, high=1.35)
-    denoise_sigma_px: Range = Range(low=0.8, high=1.8)
+    denoise_sigma_px: Range = Range(low=0.7, high=1.5)
     kept_detail_fraction: Range = Range(low=0.05, high=0.6)
     denoise_threshold: Range = Range(low=1.5, high=5.0)
-    sharpen: Range = Range(low=0.0, high=1.0)
+    sharpen: Range = Range(low=0.2, high=1.5)
     chroma_blur_px: Range = Range(low=1.0, high=4.0)
     jpeg_scene_fraction: Fraction = 0.45
-    jpeg_quality: Range = Range(low=55, high=96)
+    jpeg_quality: Range = Range(low=65, high=97)
     video_scene_fraction: Fraction = 0.35
-    video_quantizer: Range = Range(low=18, high=34)
+    video_quantizer: Range = Range(low=18, high=32)
     resampled_scene_fraction: Fraction = 0.15
     resolution_fraction: Range = Range(low=0.45, high=0.9)
     interlaced_scene_fraction: Fraction = 0.06

@@ -1,0 +1,1 @@
+"""How pictures of drawn cameras compare with photographs, and what they cost."""

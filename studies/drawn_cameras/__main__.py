@@ -1,0 +1,151 @@
+"""Compares pictures of drawn cameras with photographs, and times them.
+
+`python -m studies.drawn_cameras measure data/world-real ~/photographs`
+`python -m studies.drawn_cameras redraw data/world-89 --out out/drawn`
+`python -m studies.drawn_cameras cost`
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.recipe.camera_ranges import CameraRanges
+from datasets_manifest.storage.image_codecs import encode_png
+from datasets_manifest.storage.layout import MANIFEST_FILE
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.frame import FrameSpec
+from droguekit.api.recipe_rendering import load_recipe
+from droguekit.scoring.report.label_drawing import display_picture
+from render.camera.optics import saturation_cd_m2
+from render.camera.sensor import expose
+from render.engine import EyeRadiance, StereoRadiance
+from scenes.camera_sampling import camera_of_scene
+from scenes.sampler import sample_frame
+from studies.drawn_cameras.picture_measures import PictureMeasures, measure_pictures
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_COST_SIZE_PX = (1024, 768)
+# What clipped pixels of a linear picture may have been.
+_CLIPPED = 1.3
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, draw again, or time."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.drawn_cameras",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    measure = commands.add_parser("measure", help="a line of numbers for each folder")
+    measure.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="a dataset, or a folder of pictures")
+    redraw = commands.add_parser("redraw", help="the left images of a linear dataset as drawn cameras show them")
+    redraw.add_argument("dataset", type=Path, metavar="DIR", help="a dataset with linear images")
+    redraw.add_argument("--out", type=Path, required=True, metavar="DIR2", help="folder for the pictures")
+    cost = commands.add_parser("cost", help="CPU time of an image of 1024 x 768")
+    cost.add_argument("--scenes", type=int, default=20, metavar="N", help="cameras to time (default 20)")
+    options = parser.parse_args(arguments)
+    if options.command == "measure":
+        print("folder | " + " | ".join(field.name for field in fields(PictureMeasures)))
+        for folder in options.folders:
+            found = astuple(measure_pictures(shown_pictures(folder)))
+            print(f"{folder.name} | {found[0]} | " + " | ".join(f"{value:.3f}" for value in found[1:]), flush=True)
+    elif options.command == "redraw":
+        _redraw(Dataset(options.dataset), options.out)
+    else:
+        _time(options.scenes)
+
+
+def shown_pictures(folder: Path) -> Iterator[NDArray[np.uint8]]:
+    """Left images of a dataset, on the sRGB curve, or the pictures of a folder.
+
+    Raises:
+        ValueError: a picture cannot be read; names it.
+    """
+    if (folder / MANIFEST_FILE).exists():
+        source = Dataset(folder)
+        yield from (display_picture(source.images(index)) for index in source.frame_indices)
+        return
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in _PICTURES:
+            picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if picture is None:
+                raise ValueError(f"{path}: is no picture that OpenCV reads")
+            yield np.asarray(picture[..., ::-1], dtype=np.uint8)
+
+
+def _redraw(source: Dataset, out: Path) -> None:
+    """Take pixel values for light: what was clipped is a third brighter, and noise and blur are doubled."""
+    recipe = source.manifest.recipe
+    if recipe.sensor.encoding != "linear":
+        raise SystemExit(f"{source.path}: its images are not linear, and say less about the light")
+    sensor = recipe.sensor.model_copy(update={"encoding": "gamma", "output_bits": 8})
+    with_cameras = recipe.model_copy(update={"camera": CameraRanges(), "sensor": sensor})
+    out.mkdir(parents=True, exist_ok=True)
+    for index in source.frame_indices:
+        frame, images = source.record(index).frame, source.images(index)
+        scene_sensor, camera = camera_of_scene(with_cameras, frame.scene_id)
+        drawn = frame.model_copy(update={"sensor": scene_sensor, "camera": camera})
+        span = 2**images.bits - 1 - images.black_level_dn
+        level = np.clip((images.left.astype(np.float32) - images.black_level_dn) / span, 0, 1)
+        light = np.where(level >= 1.0, np.float32(_CLIPPED), level) * np.float32(saturation_cd_m2(frame))
+        picture = expose(drawn, _both_eyes(light.astype(np.float32))).left
+        (out / f"{index:06d}.png").write_bytes(encode_png(picture))
+
+
+def _both_eyes(light: NDArray[np.float32]) -> StereoRadiance:
+    """(H, W, 3) light that both eyes see, with nothing in front of the sky. [cd/m2]"""
+    nothing = np.zeros(light.shape[:2], np.float32)
+    eye = EyeRadiance(
+        radiance_cd_m2=light,
+        coverage=nothing,
+        part_id=nothing.astype(np.uint8),
+        depth_m=nothing,
+        normal=np.zeros((*nothing.shape, 3), np.float32),
+        amodal_px={},
+    )
+    return StereoRadiance(
+        left=eye,
+        right=eye,
+        engine="a picture",
+        engine_version="1",
+        monte_carlo_noise_fraction=0.0,
+        stage_s={},
+    )
+
+
+def _time(scenes: int) -> None:
+    """CPU time of images of smooth noise, with and without drawn cameras; the first pair compiles and is left out."""
+    cv2.setNumThreads(1)
+    width, height = _COST_SIZE_PX
+    rig = {"preset": "rgb-ideal", "encoding": "gamma", "width_px": width, "height_px": height, "focal_px": 1706.67}
+    recipe = load_recipe("world-real", rig=rig, frames={"count": scenes + 1, "scenes": scenes + 1})
+    noise = np.random.default_rng(1).random((height, width, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3.0)
+    for name, used in (("drawn cameras", recipe), ("the sensor alone", recipe.model_copy(update={"camera": None}))):
+        times_s = [_image_s(sample_frame(used, index), smooth) for index in range(scenes + 1)][1:]
+        print(
+            f"{name}: {1e3 * np.mean(times_s):.0f} ms an image, median {1e3 * np.median(times_s):.0f}, "
+            f"most {1e3 * max(times_s):.0f}",
+            flush=True,
+        )
+
+
+def _image_s(frame: FrameSpec, light: NDArray[np.float32]) -> float:
+    """CPU time of one image of a pair. [s]"""
+    seen = _both_eyes(light * np.float32(saturation_cd_m2(frame)))
+    began_s = time.process_time()
+    expose(frame, seen)
+    return (time.process_time() - began_s) / 2
+
+
+if __name__ == "__main__":
+    main()
