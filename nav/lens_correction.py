@@ -29,7 +29,7 @@ def undistort_centroids(centroids: BinaryCentroids, rig: StereoRig, eye: Eye) ->
     blobs = centroids.blobs
     round_shapes = blobs.radii_px[:, None, None] * np.eye(2)
     centers, cov = undistort_points(rig, eye, blobs.centers_px, round_shapes, centroids.cov_px2)
-    return BinaryCentroids(replace(blobs, centers_px=centers), cov)
+    return BinaryCentroids(replace(blobs, centers_px=centers), cov, room_m=centroids.room_m)
 
 
 def undistort_points(

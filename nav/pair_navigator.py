@@ -20,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.estimates import Estimate, Region
-from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.images import Pixels, StereoImages
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_centroids import NO_CENTROIDS, BinaryCentroids, box_window, window_centroids
+from nav.centroids.small_centroids import layout_with_room, small_centroids, smallest_gap_m
+from nav.centroids.small_discs import EDGELESS_RADIUS_PX, LARGEST_SMALL_RADIUS_PX
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detector
 from nav.lens_correction import undistort_centroids
@@ -180,7 +182,8 @@ class PairNavigator:
             if window[0] == window[2] or window[1] == window[3]:
                 return NO_CENTROIDS
             channel = marker_channel(images, eye, self._color, others_weight, window)
-            return undistort_centroids(window_centroids(channel, window[:2], self._layout), self._rig, eye)
+            scale_px_per_m = max(boxes[eye][2:]) / (2 * self._rim_radius_m)
+            return undistort_centroids(self._centroids_in(channel, window[:2], scale_px_per_m), self._rig, eye)
 
         larger = max(box[2] * box[3] for box in boxes.values())
         centroids = (
@@ -195,6 +198,19 @@ class PairNavigator:
             observation = replace(observation, tolerances=self._tolerances)
         stage_s = {"centroids": measured - start, "correspond": perf_counter() - measured}
         return PairMeasurement(observation, stage_s, others_weight, self._blind_eye(centroids, observation), regions)
+
+    def _centroids_in(self, channel: Pixels, corner_px: tuple[int, int], scale_px_per_m: float) -> BinaryCentroids:
+        """Regions in a part of an image, or peaks of light where the markers are too small for regions."""
+        radius_px = self._layout.radius_m * scale_px_per_m
+        peaks = None
+        if radius_px < EDGELESS_RADIUS_PX:
+            peaks = small_centroids(channel, corner_px, self._layout, scale_px_per_m)
+            if peaks.ring is not None:
+                return peaks
+        regions = window_centroids(channel, corner_px, self._layout)
+        if regions.ring is not None or radius_px > LARGEST_SMALL_RADIUS_PX:
+            return regions
+        return peaks or small_centroids(channel, corner_px, self._layout, scale_px_per_m)
 
     def _blind_eye(self, centroids: dict[Eye, BinaryCentroids], observation: Observation | NoFixReason) -> str:
         """Why one eye shows no markers where the other one does; else empty."""
@@ -275,6 +291,9 @@ def correspond(
     permutations = symmetry_permutations(layout)
     if rings[0] is None and rings[1] is None:
         return NoFixReason(f"{explain_no_match(left, 'left')}, and {explain_no_match(right, 'right')}")
+    unclear = [eye for eye, ring in zip(EYES, rings, strict=True) if ring is not None and ring.is_ambiguous]
+    if unclear:
+        return NoFixReason(f"the {unclear[0]} image is ambiguous: its regions fit the markers in more than one order")
     if rings[0] is None or rings[1] is None:
         eye, ring, centroids = (1, rings[1], right) if rings[0] is None else (0, rings[0], left)
         assert ring is not None
@@ -286,7 +305,7 @@ def correspond(
     disparity_px = rig.baseline_m * rings[0].scale_px_per_m
     costs = _costs_px(first.centers_px, second.centers_px[permutations], disparity_px)
     best = int(np.argmin(costs))
-    gap_px = _smallest_gap_m(layout) * rings[0].scale_px_per_m
+    gap_px = smallest_gap_m(layout) * rings[0].scale_px_per_m
     is_part = max(rings[0].count, rings[1].count) < least_markers(layout)
     if costs[best] > (_LARGEST_COST_FRACTION_OF_PARTS if is_part else _LARGEST_COST_FRACTION) * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
@@ -297,7 +316,7 @@ def _match_rings(
     left: BinaryCentroids, right: BinaryCentroids, rig: StereoRig, layout: MarkerLayout
 ) -> list[RingMatch | None]:
     """The ring in each image; where only one image shows it by itself, the other is searched where it must be."""
-    rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
+    rings = [centroids.ring or match_ring(centroids.blobs, _sized(layout, centroids)) for centroids in (left, right)]
     if rings[0] is None and rings[1] is None:
         return _match_cut_rings(left, right, rig, layout)
     return _match_missing_eye(rings, (left, right), rig, layout, FEW)
@@ -308,7 +327,7 @@ def _match_cut_rings(
 ) -> list[RingMatch | None]:
     """The part of the ring that the images' edges leave, in both images or in none."""
     size_px = rig.camera.width_px, rig.camera.height_px
-    parts = [match_cut_ring(centroids.blobs, layout, size_px) for centroids in (left, right)]
+    parts = [match_cut_ring(centroids.blobs, _sized(layout, centroids), size_px) for centroids in (left, right)]
     parts = _match_missing_eye(parts, (left, right), rig, layout, _FEWEST_BESIDE_A_CUT_RING)
     return [None, None] if parts[0] is None or parts[1] is None else parts
 
@@ -327,13 +346,19 @@ def _match_missing_eye(
         if rings[eye] is None and other is not None:
             disparity_px = rig.baseline_m * other.scale_px_per_m
             expected = other.moved((toward_px * disparity_px, 0.0)).affine
-            found[eye] = match_ring_near(seen[eye].blobs, layout, expected, least)
+            found[eye] = match_ring_near(seen[eye].blobs, _sized(layout, seen[eye]), expected, least)
     return found
+
+
+def _sized(layout: MarkerLayout, centroids: BinaryCentroids) -> MarkerLayout:
+    """The layout for the matching of regions: peaks without a size have the room that a marker has to itself."""
+    return layout if centroids.room_m is None else layout_with_room(layout, centroids.room_m)
 
 
 def explain_no_match(centroids: BinaryCentroids, eye: Eye) -> str:
     """The reason why an eye has no markers."""
-    return f"no ring of markers among {len(centroids.blobs)} regions of the {eye} image"
+    what = "regions" if centroids.room_m is None else "peaks of light"
+    return f"no ring of markers among {len(centroids.blobs)} {what} of the {eye} image"
 
 
 def _one_eye_arrays(only: _EyeMarkers, eye: int) -> tuple[Array, Array]:
@@ -379,11 +404,6 @@ def _costs_px(left_px: Array, right_px: Array, disparity_px: float) -> Array:
     count = both.sum(axis=(1, 2))
     costs: Array = np.sqrt(np.where(both, squares, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1))
     return np.where(count > 0, costs, np.inf)
-
-
-def _smallest_gap_m(layout: MarkerLayout) -> float:
-    squares = ((layout.centers_m[:, None] - layout.centers_m) ** 2).sum(axis=2)
-    return float(np.sqrt(squares[np.triu_indices(layout.count, 1)].min()))
 
 
 def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers) -> tuple[Array, Array]:

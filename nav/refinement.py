@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from nav.centroids.face_background import VISIBLE_MARGIN_PX, FaceBackground
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.motion_blur import ImageMotion
 from nav.centroids.outline_pixels import WHOLE_RADIUS_PX
+from nav.centroids.small_discs import EDGELESS_RADIUS_PX, LARGEST_SMALL_RADIUS_PX, fit_small_discs
 from nav.lens_correction import distort_points, undistort_points
 from nav.matching.marker_channel import PLAIN, balancing_weight
 from nav.pose.joint import joint
@@ -45,8 +47,8 @@ def rough_pose(observation: Observation) -> Solution | NoFixReason:
 
 def refine(
     images: StereoImages, color: int | None, observation: Observation, rough: Solution, others_weight: float = PLAIN
-) -> Observation:
-    """Measure the same markers by the edge model, and the hub where it is visible.
+) -> Observation | NoFixReason:
+    """Measure the same markers by the edge model, or small ones by their blurred picture; and the hub if it is visible.
 
     Args:
         images: the pair.
@@ -57,21 +59,43 @@ def refine(
 
     Returns:
         Edge-fitted markers, without those that the fit rejects (clipped, cut, shadowed, occluded). Where too few fit,
-        the observation as given. Hub edges are measured where the pose of the fitted markers predicts them.
+        the observation as given, or the reason where all are small. Hub edges are measured where the pose of the fitted
+        markers predicts them.
     """
     layout = observation.layout
     radius_px = observation.rig.camera.fx_px * layout.radius_m / rough.left_from_drogue.translation_m[2]
     discs = _initial_discs(observation, rough, radius_px)
     face = _face_background(layout, np.nonzero(observation.seen)[1], radius_px / layout.radius_m)
+    if radius_px < EDGELESS_RADIUS_PX:
+        return _refine_small(images, observation, discs, face)
     is_narrow = face is not None and face.margin_px <= VISIBLE_MARGIN_PX
     if is_narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         others_weight = _balanced_weight(images, color, observation, rough, others_weight)
     signals = marker_signals(images, color, _concatenate([discs, *_likely_hubs(observation, rough)]), others_weight)
     fits = fit_discs(signals, discs, face)
     if fits.noise is None or _left_in_each_eye(observation, fits).min() < min(_LEAST_MARKERS, layout.count):
-        return observation
+        if radius_px > LARGEST_SMALL_RADIUS_PX:
+            return observation
+        small = _refine_small(images, observation, discs, face)
+        return observation if isinstance(small, NoFixReason) else small
     refined = _with_markers(observation, fits)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
+
+
+def _refine_small(
+    images: StereoImages, observation: Observation, discs: Ellipses, face: FaceBackground | None
+) -> Observation | NoFixReason:
+    """Measure small markers by their blurred picture; the reason where an eye has too few that can be fitted."""
+    fits = fit_small_discs(images, discs, face)
+    eyes = np.nonzero(observation.seen)[0]
+    for eye in np.unique(eyes):
+        mine = eyes == eye
+        left = int(fits.accepted[mine].sum())
+        if left < min(_LEAST_MARKERS, observation.layout.count):
+            reasons = Counter(reason for reason, own in zip(fits.reasons, mine, strict=True) if own and reason)
+            told = f"{left} of {int(mine.sum())} small markers of the {EYES[eye]} image can be fitted"
+            return NoFixReason(f"{told}; most others: {reasons.most_common(1)[0][0]}")
+    return _with_markers(observation, fits)
 
 
 def _initial_discs(observation: Observation, rough: Solution, radius_px: float) -> Ellipses:

@@ -43,11 +43,13 @@ class BinaryCentroids:
         blobs: centres [px] and areas, in full-image coordinates.
         cov_px2: (M, 2, 2) covariances of the centres.
         ring: the drogue's ring among them, None where it was not searched or not found.
+        room_m: of peaks without a size, whose areas stand for it: radius of the room that a marker has to itself. [m]
     """
 
     blobs: Blobs
     cov_px2: Array
     ring: RingMatch | None = None
+    room_m: float | None = None
 
 
 NO_CENTROIDS = BinaryCentroids(blobs=Blobs(np.zeros((0, 2)), np.zeros(0)), cov_px2=np.zeros((0, 2, 2)))

@@ -378,6 +378,7 @@ def blurred_step(z: Array32) -> tuple[Array32, Array32]:
 
     Source: M. Abramowitz and I. Stegun, Handbook of Mathematical Functions, 7.1.26.
     """
+    z = np.ascontiguousarray(z)
     step, bell = np.empty_like(z), np.empty_like(z)
     blurred_steps(z.ravel(), np.float32(1), step.ravel(), bell.ravel())
     return step, bell

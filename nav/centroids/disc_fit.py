@@ -32,7 +32,7 @@ from nav.centroids.discs import (
     unfitted_discs,
     with_part,
 )
-from nav.centroids.ellipses import Ellipses
+from nav.centroids.ellipses import Ellipses, are_positive
 from nav.centroids.face_background import FaceBackground, background_shares, pixels_on_face, visible_margin_px
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import ImageMotion, detect_motion, fit_motion, motion_blurred
@@ -171,7 +171,8 @@ def _fit_given_motion(
         return pixels, still, minimum
     # The fitted places of the markers now show the face to hundredths of a pixel. Around larger discs the face is so
     # wide that tenths are enough.
-    found = _fitted_ellipses(start, pixels, minimum, (None,) * len(start))
+    lost = ~np.isfinite(minimum.parameters).all(axis=1) | ~are_positive(parameter_shapes(minimum.parameters))
+    found = _fitted_ellipses(start, pixels, minimum, tuple("the fit left the disc" if each else None for each in lost))
     width_px = float(np.median(minimum.parameters[:, DISC_WIDTH]))
     still = disc_model(pixels, sloped, shaded, background_shares(face, found, pixels, width_px, motions))
     model = still if motions is None else motion_blurred(still, motions, (0,))

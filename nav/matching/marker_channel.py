@@ -130,6 +130,26 @@ def _color_excess(own: Pixels, others: Pixels, others_weight: float) -> Pixels:
     return np.asarray(cv2.subtract(own, weighted.astype(own.dtype)))
 
 
+def linear_light(images: StereoImages, eye: Eye, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Light of a part of an image where the sensor measured it, and what it clips.
+
+    Args:
+        images: the pair.
+        eye: which of the two.
+        window: left, top, right, bottom (the last two exclusive) of the part.
+
+    Returns:
+        (H, W, 3) or (H, W), proportional to light above the black level, negative where noise is below it; of a Bayer
+        sensor the raw mosaic. And (H, W, 3) or (H, W) whether the number is the sensor's highest.
+    """
+    image, mosaic = (images.left, images.left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
+    left, top, right, bottom = window
+    part = (image if mosaic is None else mosaic)[top:bottom, left:right]
+    if mosaic is None and images.encoding == "gamma":
+        return _linear(part, images).astype(np.float32), part >= 2**images.bits - 1
+    return part.astype(np.float32) - np.float32(images.black_level_dn), part >= 2**images.bits - 1
+
+
 def _linear(image: Pixels, images: StereoImages) -> Pixels:
     """The image proportional to light, black level removed."""
     if images.encoding == "linear":

@@ -37,6 +37,9 @@ _MOST_OFF = 3.0
 # A complete ring this close to its map ends the search.
 _GOOD_RMS_FRACTION = 0.1
 _CHUNK = 2048
+# Another order of the markers is as good where its distances from the map are at most this many times as large, and
+# another one where it moves a marker by more than this many radii.
+_AS_GOOD, _ELSEWHERE = 2.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +51,14 @@ class RingMatch:
         blob_of_marker: (N,) index of each marker's blob, -1 for a missing one; modulo the layout's symmetry.
         rms_fraction: root mean square distance of the blobs from the map, as a share of a marker's radius.
         lean_px_per_m: (2,) how far markers behind the rim plane are moved, per depth; zero where all have one depth.
+        is_ambiguous: whether the blobs fit the markers in another order as well, that is no rotation of the layout.
     """
 
     affine: Array
     blob_of_marker: NDArray[np.int64]
     rms_fraction: float
     lean_px_per_m: Array = field(default_factory=lambda: np.zeros(2))
+    is_ambiguous: bool = False
 
     @property
     def count(self) -> int:
@@ -137,6 +142,7 @@ def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | N
     if len(blobs) < least:
         return None
     best: RingMatch | None = None
+    others: list[RingMatch] = []
     permutations = symmetry_permutations(layout)
     tried: set[bytes] = set()
     for turn, shift in _best_guesses(blobs, layout):
@@ -148,11 +154,24 @@ def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | N
             continue
         tried.add(key)
         match = _fit(blob_of_marker, blobs, layout, least)
-        if match is not None and (best is None or _rank(match) > _rank(best)):
-            best = match
+        if match is not None:
+            others.append(match)
+            best = match if best is None or _rank(match) > _rank(best) else best
         if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
-            break
-    return best
+            return best
+    if best is None or not any(_differ(best, other, layout) for other in others):
+        return best
+    return replace(best, is_ambiguous=True)
+
+
+def _differ(best: RingMatch, other: RingMatch, layout: MarkerLayout) -> bool:
+    """Whether another match is as good, and puts markers elsewhere in whatever rotation of the layout."""
+    rms_fraction = max(best.rms_fraction, _GOOD_RMS_FRACTION)
+    if other.count < best.count or other.rms_fraction > _AS_GOOD * rms_fraction:
+        return False
+    one, two = (_places_px(layout, match.affine, match.lean_px_per_m) for match in (best, other))
+    moved_px = np.hypot(*(two[symmetry_permutations(layout)] - one).transpose(2, 0, 1)).max(axis=1).min()
+    return bool(moved_px > _ELSEWHERE * layout.radius_m * np.sqrt(_determinant(best.affine)))
 
 
 def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array, least: int = FEW) -> RingMatch | None:

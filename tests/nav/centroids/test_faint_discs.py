@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from datasets_manifest.types.images import StereoImages
 from nav.centroids.blurred_edges import DISC_LEVEL
 from nav.centroids.centroid_uncertainty import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import contrasts, disc_model, initial_disc_parameters, rejection_reasons
+from nav.centroids.ellipses import circles
+from nav.centroids.face_background import FaceBackground
+from nav.centroids.marker_signal import marker_signals
 from nav.centroids.outline_pixels import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
 from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px
@@ -64,3 +68,16 @@ def test_an_outline_turned_inside_out_is_no_disc() -> None:
     reasons = rejection_reasons(truth, pixels, replace(fit, parameters=turned), inside, cov, noise, spread)
     assert reasons[0] == "the fit left the disc"
     assert "the fit left the disc" not in reasons[1:]
+
+
+def test_fits_that_lose_the_shape_of_a_disc_of_a_pixel_are_told() -> None:
+    """Discs in noise beside the edge of a narrow face: some fits end at an ellipse that is none."""
+    rng, count, scale = np.random.default_rng(39), 6, 110.0
+    angle = 2 * np.pi * np.arange(count) / count
+    places_m = 0.28 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    image = rng.normal(300, 30, (100, 100)).astype(np.uint16)
+    images = StereoImages(image, image, 0.0, 1e-3, bits=12)
+    discs = circles(np.zeros(count), places_m * scale + 50, np.full(count, 0.01 * scale))
+    face = FaceBackground(places_m, (0.25, 0.305), 1.6)
+    fits = fit_discs(marker_signals(images, None, discs), discs, face)
+    assert not fits.accepted.any()

@@ -1,0 +1,365 @@
+"""Centres of discs of 0.3 to 3 px radius by fits of their blurred picture.
+
+The edge model of `nav.centroids.disc_fit` needs pixels that lie within a disc. Here the disc's size is known from the
+rough pose, and its place, its light and the light beside it are fitted, in every colour that the sensor measures and at
+the sites where it does. The point spread is common to both images. The covariance is the inverse of the Fisher
+information (the Cramer-Rao bound) at the noise that the residuals show, widened where a fit is worse than that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from datasets_manifest.types.images import StereoImages
+from geometry.se3 import Array
+from geometry.stereo import EYES
+from nav.centroids.centroid_uncertainty import NoiseModel, widen_for_nonlinearity
+from nav.centroids.disc_coverage import SpreadDiscs, spread_discs
+from nav.centroids.discs import DiscFits
+from nav.centroids.ellipses import Ellipses
+from nav.centroids.face_background import FaceBackground, background_shares
+from nav.centroids.outline_pixels import OutlinePixels
+from nav.centroids.pixel_response import reduced_equations
+from nav.matching.marker_channel import linear_light
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
+
+EDGELESS_RADIUS_PX = 1.5
+"""Smaller discs have no pixels that show one side of their edge only, which the edge model needs. [px]"""
+LARGEST_SMALL_RADIUS_PX = 3.0
+"""Up to this radius, discs that the edge model does not fit are fitted here. [px]"""
+# Margin of a window around a disc. [px]
+_MARGIN_PX = 3.5
+# Pixels that get more of their light from beyond the face are left out, unless they get light of the disc.
+_MOST_BEYOND, _OWN_PX = 0.5, 2.0
+# Spread of the light by lens and pixels: the first guess, the limits, and the largest step between two fits. [px]
+_FIRST_SIGMA_PX, _SIGMAS_PX, _LARGEST_SIGMA_STEP_PX = 0.5, (0.2, 2.0), 0.3
+# Cells of a pixel: a lens that spreads light before the pixels collect it, and pixels that spread it afterwards.
+_CELLS = (4, 1)
+# Where a disc lies within one pixel of a sensor that spreads light afterwards, its image does not change with its
+# place, and only the pixel is known: the standard deviation of a place that may be anywhere in most of it. [px]
+_WITHIN_PIXEL_PX = 0.2
+# An own light of fewer standard deviations may be noise.
+_LEAST_STRENGTH = 4.0
+# Of a disc's light this share must lie in pixels that are used; clipped ones are not.
+_LEAST_SHARE = 0.05
+_LARGEST_MOVE_PX = 1.0
+_LARGEST_CHI2 = 6.0
+_QUANTISATION_DN2 = 1 / 12
+# Median of the squares of normal residuals; squares above this many variances are not noise; the mean of the others.
+_MEDIAN_OF_SQUARES, _ODD_SQUARE, _KEPT_SQUARE = 0.455, 12.0, 0.993
+_NOISE_STEPS = 4
+_LARGEST_LEVERAGE = np.float32(0.9)
+_TURNS, _STEPS, _SMALL_STEP_PX = 3, 8, 0.002
+# Smaller discs may lie within one pixel.
+_FLAT_RADIUS_PX = 0.7
+_GRID_PX = np.arange(-0.6, 0.61, 0.2)
+# Bayer's cell RGGB: the class of the site at the row's and the column's parity.
+_SITES = np.array([[0, 1], [1, 2]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """Windows of pixels around N discs, all of one size.
+
+    Attributes:
+        values: (N, K) light above the black level. [DN]
+        present: (N, K) 1 for samples that are used, 0 for clipped ones and those beyond the image.
+        classes: (N, C, K) 1 where a sample is of that colour.
+        x_px, y_px: (N, K) places from `middles_px`.
+        middles_px: (N, 2) middle pixels of the windows.
+        half: windows have 2 half + 1 pixels a side; K is their number, or three times that in a colour image.
+    """
+
+    values: Array32
+    present: Array32
+    classes: Array32
+    x_px: Array32
+    y_px: Array32
+    middles_px: Array
+    half: int
+
+    def samples(self, pictures: Array) -> Array32:
+        """(M, K) samples of pictures (M, W, W), the same in every colour."""
+        flat = pictures.reshape(len(pictures), -1).astype(np.float32)
+        return np.ascontiguousarray(np.tile(flat, (1, self.values.shape[1] // flat.shape[1])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """All discs, fitted by one kind of point spread.
+
+    Attributes:
+        minimum: parameters are the place from the window's middle, the light of each colour, and the light beside.
+        sigma_px: of the spread.
+        weights: (N, K + 2) inverse variances, the last two of the place before the fit.
+        share: (N,) of the disc's light in samples that are used.
+        loss: twice the negative logarithm of the evidence (Laplace's approximation), to choose the kind of spread by.
+    """
+
+    minimum: Minimum
+    sigma_px: float
+    weights: Array32
+    share: Array
+    loss: float
+
+
+def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground | None = None) -> DiscFits:
+    """Fit every disc of both eyes by its blurred picture.
+
+    Args:
+        images: the pair.
+        discs: outlines of known size, with centres right to about half a pixel.
+        face: the face that they lie on; None where there is none, and the light beside a disc is a plane.
+
+    Returns:
+        Centres with covariances, or reasons. Shapes are the given ones.
+    """
+    windows = _cut_windows(images, discs)
+    fit = min((_fit(windows, discs, face, cells) for cells in _CELLS), key=lambda fit: fit.loss)
+    parameters, cov = fit.minimum.parameters, fit.minimum.covariance()
+    chi2 = _chi2(fit)
+    inflation = np.maximum(chi2, 1.0)
+    colors = windows.classes.shape[1]
+    light, light_cov = parameters[:, 2 : 2 + colors], cov[:, 2 : 2 + colors, 2 : 2 + colors]
+    # The light of all colours together, against its own uncertainty.
+    strength = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", light, np.linalg.pinv(light_cov), light), 0) / inflation)
+    centers = windows.middles_px + parameters[:, :2]
+    moved = np.hypot(*(centers - discs.centers_px).T)
+    center_cov = widen_for_nonlinearity(cov[:, :2, :2] * inflation[:, None, None])
+    tests = (
+        (fit.share < _LEAST_SHARE, "cut by the edge of the image, or clipped: brighter than the sensor's range"),
+        (~((strength > _LEAST_STRENGTH) & (light.sum(axis=1) > 0)), "no contrast"),
+        (~(moved < _LARGEST_MOVE_PX) | ~np.isfinite(center_cov).all(axis=(1, 2)), "the fit left the disc"),
+        (chi2 > _LARGEST_CHI2, "uneven: not the picture of a small disc"),
+    )
+    reasons = tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
+    good = np.array([reason is None for reason in reasons], dtype=np.bool_)
+    background = parameters[:, 2 + colors]
+    return DiscFits(
+        ellipses=Ellipses(discs.eyes, np.where(good[:, None], centers, discs.centers_px), discs.shapes_px),
+        cov_px2=center_cov,
+        contrast_dn=light.max(axis=1),
+        background_dn=background,
+        edge_width_px=np.full(len(discs), np.hypot(fit.sigma_px, np.sqrt(1 / 12))),
+        chi2_per_dof=chi2,
+        inflation=inflation,
+        reasons=reasons,
+        noise=NoiseModel(float(1 / np.median(fit.weights[:, :-2][fit.weights[:, :-2] > 0])), 0.0, 0.0),
+    )
+
+
+def _chi2(fit: _Fit) -> Array:
+    """(N,) mean squares of the residuals over their variances."""
+    weights, residuals = fit.weights[:, :-2], fit.minimum.residuals[:, :-2]
+    freedom = np.maximum((weights > 0).sum(axis=1) - fit.minimum.parameters.shape[1], 1)
+    mean: Array = (weights * residuals**2).sum(axis=1) / freedom
+    return mean
+
+
+def _cut_windows(images: StereoImages, discs: Ellipses) -> _Windows:
+    half = int(np.ceil(discs.radii_px.max() + _MARGIN_PX))
+    offsets = np.arange(-half, half + 1)
+    middles = np.rint(discs.centers_px).astype(np.int64)
+    columns, rows = middles[:, :1] + offsets, middles[:, 1:] + offsets
+    width, height = images.size_px
+    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
+    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    parts = []
+    for index in np.unique(discs.eyes):
+        mine = np.flatnonzero(discs.eyes == index)
+        left, top = int(columns[mine].min()), int(rows[mine].min())
+        window = left, top, int(columns[mine].max()) + 1, int(rows[mine].max()) + 1
+        light, clipped = linear_light(images, EYES[index], window)
+        place = rows[mine][:, :, None] - top, columns[mine][:, None, :] - left
+        parts.append(
+            (mine, light[place], inside[mine].reshape(inside[mine].shape + (1,) * (light.ndim - 2)) & ~clipped[place])
+        )
+    order = np.argsort(np.concatenate([mine for mine, _, _ in parts]))
+    values, present = (_by_color(np.concatenate([part[place] for part in parts])[order]) for place in (1, 2))
+    if images.left_mosaic is not None:
+        site = _SITES[rows[:, :, None] % 2, columns[:, None, :] % 2].reshape(len(discs), 1, -1)
+        classes = (site == np.arange(_SITES.max() + 1)[:, None]).astype(np.float32)
+    else:
+        planes = values.shape[1] // len(offsets) ** 2
+        one = np.repeat(np.eye(planes, dtype=np.float32), len(offsets) ** 2, axis=1)
+        classes = np.broadcast_to(one, (len(discs), *one.shape))
+    y, x = (np.broadcast_to(each, (len(discs), *each.shape)) for each in np.meshgrid(offsets, offsets, indexing="ij"))
+    empty = _Windows(values, present.astype(np.float32), classes, values, values, middles.astype(np.float64), half)
+    return replace(empty, x_px=empty.samples(x), y_px=empty.samples(y))
+
+
+def _by_color(pixels: NDArray[Any]) -> NDArray[Any]:
+    """(N, K) samples of windows (N, W, W) or (N, W, W, 3), one colour after the other."""
+    return np.ascontiguousarray(np.moveaxis(pixels, 3, 1) if pixels.ndim == 4 else pixels).reshape(len(pixels), -1)
+
+
+def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells: int) -> _Fit:
+    """Fit all discs by one kind of spread; its width, neighbours' light and the noise follow from the fits before."""
+    centers, sigma_px, variances = discs.centers_px, _FIRST_SIGMA_PX, np.ones_like(windows.values)
+    beside = np.zeros_like(windows.values)
+    for turn in range(_TURNS):
+        basis, chosen = _background_basis(windows, discs, centers, face, sigma_px)
+        prior = np.full((len(discs), 2), _WITHIN_PIXEL_PX**-2, np.float32)
+        weights = np.concatenate([windows.present * chosen / variances, prior], axis=1)
+        model = _disc_model(windows, discs.radii_px, basis, (sigma_px, cells))
+        count = windows.classes.shape[1] * (1 + basis.shape[1])
+        places, light = centers - windows.middles_px, windows.values - beside
+        if cells == 1 and turn > 0 and discs.radii_px.min() < _FLAT_RADIUS_PX:
+            places = _best_places(model, light, weights, places, count)
+        start = _with_light(model, light, weights, places, count)
+        data = np.concatenate([light, places.astype(np.float32)], axis=1)
+        minimum = minimise(model, data, weights, start, _STEPS, _SMALL_STEP_PX)
+        if turn == _TURNS - 1:
+            break
+        kept = np.abs(minimum.parameters[:, :2] - places).max(axis=1) < _LARGEST_MOVE_PX
+        centers = np.where(kept[:, None], windows.middles_px + minimum.parameters[:, :2], discs.centers_px)
+        variances = _variances(windows, minimum, weights)
+        sigma_px = _common_sigma(windows, discs.radii_px, minimum, weights, (sigma_px, cells))
+        beside = _light_of_neighbours(windows, discs, minimum, (sigma_px, cells))
+    used = weights[:, :-2]
+    misfit = float((used * minimum.residuals[:, :-2] ** 2).sum() - np.log(used[used > 0]).sum())
+    # A spread by which all discs would happen to lie at the middles of pixels is less likely than one that leaves their
+    # places open.
+    loss = misfit - float(np.log(np.linalg.det(minimum.covariance()[:, :2, :2])).sum())
+    light = windows.samples(_pictures(windows, discs.radii_px, minimum.parameters, (sigma_px, cells)).light)
+    share = (light * (used > 0)).sum(axis=1) / light.sum(axis=1)
+    return _Fit(minimum, sigma_px, weights, share, loss)
+
+
+def _with_light(model: Model, light: Array32, weights: Array32, places_px: Array, count: int) -> Minimum:
+    """Discs at given places (N, 2) with the light of `count` amounts that fits best."""
+    start = np.concatenate([places_px, np.zeros((len(places_px), count))], axis=1)
+    data = np.concatenate([light, places_px.astype(np.float32)], axis=1)
+    # Without light nothing depends on the place, so the first step is that of the light alone.
+    return minimise(model, data, weights, evaluate(model, data, weights, start), 1, np.inf)
+
+
+def _best_places(model: Model, light: Array32, weights: Array32, places_px: Array, count: int) -> Array:
+    """(N, 2) the means of the places on a grid about the given ones, by their likelihood.
+
+    The image of a disc that lies within one pixel does not show in which direction a better place lies.
+    """
+    offsets = np.stack(np.meshgrid(_GRID_PX, _GRID_PX), axis=-1).reshape(-1, 2)
+    misfits = np.stack(
+        [
+            (_with_light(model, light, weights, places_px + offset, count).residuals ** 2 * weights).sum(axis=1)
+            for offset in offsets
+        ]
+    )
+    likelihood = np.exp((misfits.min(axis=0) - misfits) / 2)
+    means: Array = places_px + likelihood.T @ offsets / likelihood.sum(axis=0)[:, None]
+    return means
+
+
+def _pictures(windows: _Windows, radii_px: Array, parameters: Array, spread: tuple[float, int]) -> SpreadDiscs:
+    sigma_px, cells = spread
+    inside = np.clip(parameters[:, :2], -windows.half, windows.half)
+    return spread_discs(inside, radii_px, np.full(len(radii_px), sigma_px), windows.half, cells)
+
+
+def _disc_model(windows: _Windows, radii_px: Array, basis: Array32, spread: tuple[float, int]) -> Model:
+    """The picture of discs, and last their place, which is known to a pixel before the fit."""
+    classes = windows.classes
+    count, colors, size = classes.shape
+    backgrounds = (classes[:, :, None] * basis[:, None]).reshape(count, -1, size)
+
+    def model(parameters: Array) -> tuple[Array32, Array32]:
+        pictures = _pictures(windows, radii_px, parameters, spread)
+        light, by_x, by_y = (windows.samples(each) for each in (pictures.light, pictures.by_x, pictures.by_y))
+        linear = np.concatenate([classes * light[:, None], backgrounds], axis=1)
+        amounts = parameters[:, 2:].astype(np.float32)
+        level = np.einsum("nc,nck->nk", amounts[:, :colors], classes)
+        jacobian = np.zeros((count, parameters.shape[1], size + 2), np.float32)
+        jacobian[:, 0, :-2], jacobian[:, 1, :-2], jacobian[:, 2:, :-2] = level * by_x, level * by_y, linear
+        jacobian[:, 0, -2] = jacobian[:, 1, -1] = 1
+        picture = np.einsum("np,npk->nk", amounts, linear)
+        return np.concatenate([picture, parameters[:, :2].astype(np.float32)], axis=1), jacobian
+
+    return model
+
+
+def _background_basis(
+    windows: _Windows, discs: Ellipses, centers_px: Array, face: FaceBackground | None, sigma_px: float
+) -> tuple[Array32, Array32]:
+    """(N, B, K) pictures of the light beside the discs, and (N, K) 1 for the samples that they describe."""
+    constant = np.ones_like(windows.values)[:, None]
+    shares = None
+    if face is not None:
+        nothing = np.zeros_like(windows.values)
+        pixels = OutlinePixels(
+            x_px=windows.x_px,
+            y_px=windows.y_px,
+            values=nothing,
+            present=windows.present,
+            clipped=nothing > 0,
+            origins_px=windows.middles_px,
+            truncated=np.zeros(len(discs), np.bool_),
+        )
+        placed = Ellipses(discs.eyes, centers_px, discs.shapes_px)
+        shares = background_shares(face, placed, pixels, float(np.hypot(sigma_px, np.sqrt(1 / 12))), None)
+    if shares is None:
+        half = np.float32(windows.half)
+        slopes = np.stack([windows.x_px / half, windows.y_px / half], axis=1)
+        return np.concatenate([constant, slopes], axis=1), np.ones_like(windows.values)
+    near = np.hypot(windows.x_px, windows.y_px) < discs.radii_px[:, None] + _OWN_PX
+    chosen = near | (shares.sum(axis=1) < _MOST_BEYOND)
+    return np.concatenate([constant, shares], axis=1), chosen.astype(np.float32)
+
+
+def _variances(windows: _Windows, minimum: Minimum, weights: Array32) -> Array32:
+    """(N, K) variances that grow with the light, by a robust line through the squared residuals. [DN^2]"""
+    residuals = minimum.residuals[:, :-2]
+    levels = windows.values - residuals
+    # The brightest pixels of a small disc draw the fit towards them.
+    leverages = np.minimum(minimum.leverages(minimum.covariance(), weights)[:, :-2], _LARGEST_LEVERAGE)
+    used = weights[:, :-2] > 0
+    squares = (residuals**2 / (1 - leverages))[used].astype(np.float64)
+    light = np.maximum(levels[used], 0.0).astype(np.float64)
+    dark, growth = max(float(np.median(squares)) / _MEDIAN_OF_SQUARES, _QUANTISATION_DN2), 0.0
+    for _ in range(_NOISE_STEPS):
+        variance = dark + growth * light
+        kept = squares < _ODD_SQUARE * variance
+        root = 1 / variance[kept]
+        design = np.stack([root, light[kept] * root], axis=1)
+        (dark, growth), _ = nnls(design, squares[kept] * root / _KEPT_SQUARE)
+        dark = max(dark, _QUANTISATION_DN2)
+    variances: Array32 = np.float32(dark) + np.float32(growth) * np.maximum(levels, 0)
+    return variances
+
+
+def _common_sigma(
+    windows: _Windows, radii_px: Array, minimum: Minimum, weights: Array32, spread: tuple[float, int]
+) -> float:
+    """The spread after one step towards the one that fits all discs best. [px]"""
+    pictures = _pictures(windows, radii_px, minimum.parameters, spread)
+    colors = windows.classes.shape[1]
+    level = np.einsum("nc,nck->nk", minimum.parameters[:, 2 : 2 + colors].astype(np.float32), windows.classes)
+    slope = np.pad(level * windows.samples(pictures.by_sigma), ((0, 0), (0, 2)))
+    normal, gradient = reduced_equations(minimum, slope[:, None], weights)
+    known = normal[:, 0, 0] > 0
+    step = float(gradient[known].sum() / max(normal[known].sum(), np.finfo(float).tiny))
+    sigma_px = spread[0] + float(np.clip(step, -_LARGEST_SIGMA_STEP_PX, _LARGEST_SIGMA_STEP_PX))
+    return float(np.clip(sigma_px, *_SIGMAS_PX))
+
+
+def _light_of_neighbours(windows: _Windows, discs: Ellipses, minimum: Minimum, spread: tuple[float, int]) -> Array32:
+    """(N, K) light of all other discs in each disc's window. [DN]"""
+    centers = windows.middles_px + minimum.parameters[:, :2]
+    reach_px = windows.half + discs.radii_px.max() + 4 * spread[0]
+    gaps = np.abs(centers[None] - windows.middles_px[:, None]).max(axis=2)
+    here, other = np.nonzero((gaps < reach_px) & (discs.eyes[:, None] == discs.eyes) & ~np.eye(len(discs), dtype=bool))
+    beside = np.zeros_like(windows.values)
+    if len(here) == 0:
+        return beside
+    places, sigma = centers[other] - windows.middles_px[here], np.full(len(here), spread[0])
+    pictures = windows.samples(spread_discs(places, discs.radii_px[other], sigma, windows.half, spread[1]).light)
+    colors = windows.classes.shape[1]
+    amounts = np.maximum(minimum.parameters[other, 2 : 2 + colors], 0).astype(np.float32)
+    np.add.at(beside, here, np.einsum("mc,mck->mk", amounts, windows.classes[here]) * pictures)
+    return beside

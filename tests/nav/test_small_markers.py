@@ -1,0 +1,110 @@
+"""Small markers from peaks of light to poses: layouts that are no ring, at several depths, and ambiguous ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.types.images import StereoImages
+from drogue_models.marker_layout import MarkerLayout
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform, rotation_from_angles
+from geometry.stereo import EYES, StereoRig
+from nav.centroids.disc_coverage import spread_discs
+from nav.centroids.small_centroids import small_centroids
+from nav.matching.blobs import Blobs
+from nav.matching.ring_matching import match_ring
+from nav.pair_navigator import correspond
+from nav.pose.joint import joint
+from nav.pose.pose_method import NoFixReason, Observation, Solution
+from nav.refinement import refine
+
+RADIUS_M, RIM_M = 0.01, 0.305
+CAMERA = PinholeCamera(640, 480, 1740.0, 1740.0, 319.5, 239.5)
+RIG = StereoRig(CAMERA, 0.25, RigidTransform(np.eye(3), np.zeros(3)), np.zeros(3))
+
+
+def ring(count: int, radius_m: float = 0.28, depth_m: float = 0.0, turn: float = 0.0) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(count) / count + turn
+    return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(count, depth_m)], axis=1)
+
+
+def layout_of(centers_m: np.ndarray) -> MarkerLayout:
+    return MarkerLayout(centers_m, RADIUS_M, None)
+
+
+def pair_of(layout: MarkerLayout, pose: RigidTransform, rng: np.random.Generator) -> StereoImages:
+    """A pair that shows lamps before an even background, with the noise of a sensor."""
+    images = []
+    for eye in EYES:
+        mean_e = np.full((CAMERA.height_px, CAMERA.width_px), 400.0)
+        for center_px in RIG.image(pose.apply(layout.centers_m), eye):
+            x, y = np.rint(center_px).astype(int)
+            radius = np.array([CAMERA.fx_px * RADIUS_M / pose.translation_m[2]])
+            drawn = spread_discs(center_px[None] - (x, y), radius, np.array([0.5]), 6, 4).light[0]
+            mean_e[y - 6 : y + 7, x - 6 : x + 7] += 3000 * drawn
+        images.append(np.rint(0.35 * (rng.poisson(mean_e) + rng.normal(0, 5, mean_e.shape))).clip(0, 4095) + 64)
+    return StereoImages(*(image.astype(np.uint16) for image in images), 0.0, 1e-3, bits=12, black_level_dn=64.0)
+
+
+def measured(layout: MarkerLayout, images: StereoImages, pose: RigidTransform) -> Observation | NoFixReason:
+    """Peaks, correspondence, and fits, as navigation chains them."""
+    scale, found = CAMERA.fx_px / pose.translation_m[2], []
+    for eye, image in zip(EYES, (images.left, images.right), strict=True):
+        x, y = RIG.image(pose.translation_m, eye)
+        reach = 1.3 * RIM_M * scale
+        left, top, right, bottom = (int(side) for side in (x - reach, y - reach, x + reach, y + reach))
+        found.append(small_centroids(image[top:bottom, left:right], (left, top), layout, 1.2 * scale))
+    matched = correspond(*found, RIG, layout)
+    if isinstance(matched, NoFixReason):
+        return matched
+    rough = joint(matched)
+    assert isinstance(rough, Solution)
+    return refine(images, None, matched, rough)
+
+
+LAYOUTS = {
+    "ring of 12": ring(12),
+    "ring of 24": ring(24),
+    "four of a kite": np.array([[0.28, 0, 0], [0.05, 0.27, 0], [-0.22, 0.03, 0], [0.02, -0.2, 0]]),
+    "uneven six": np.array(
+        [[0.28, 0, 0], [0.2, 0.2, 0], [-0.05, 0.27, 0], [-0.28, 0.05, 0], [-0.1, -0.2, 0], [0.15, -0.2, 0]]
+    ),
+    "two depths": np.concatenate([ring(8), ring(6, 0.2, 0.12, 0.2)]),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("distance_m", [12.0, 24.0])
+def test_lamps_of_a_centimetre_give_a_pose_within_its_covariance(name: str, distance_m: float) -> None:
+    layout, rng = layout_of(LAYOUTS[name]), np.random.default_rng(7)
+    pose = RigidTransform(rotation_from_angles(*np.radians([5, -6, 4])), np.array([0.1, -0.2, distance_m]))
+    observation = measured(layout, pair_of(layout, pose, rng), pose)
+    assert isinstance(observation, Observation), observation
+    assert observation.seen.all()
+    solution = joint(observation)
+    assert isinstance(solution, Solution)
+    error_m = solution.left_from_drogue.translation_m - pose.translation_m
+    assert np.all(np.abs(error_m) < 4 * np.sqrt(np.diag(solution.covariance)[:3]))
+
+
+def test_a_layout_that_fits_in_two_orders_is_told() -> None:
+    """Eleven of twelve places: with the marker beside the gap hidden, the gap may be on either side of its place."""
+    layout = layout_of(ring(12)[:11])
+    places = ring(12)[:10, :2] * 200 + 100
+    blobs = Blobs(places, np.full(10, np.pi * (200 * RADIUS_M) ** 2))
+    found = match_ring(blobs, layout)
+    assert found is not None
+    assert found.is_ambiguous
+    whole = match_ring(Blobs(ring(12)[:11, :2] * 200 + 100, np.full(11, np.pi * (200 * RADIUS_M) ** 2)), layout)
+    assert whole is not None
+    assert not whole.is_ambiguous
+
+
+def test_lamps_that_are_too_faint_are_told() -> None:
+    layout, rng = layout_of(ring(12)), np.random.default_rng(8)
+    pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 20.0]))
+    images = pair_of(layout_of(np.zeros((0, 3))), pose, rng)
+    told = measured(layout, images, pose)
+    assert isinstance(told, NoFixReason)
+    assert "peaks of light" in told.reason
