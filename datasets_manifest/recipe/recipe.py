@@ -17,7 +17,7 @@ from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.recipe.hose_ranges import HoseRanges
 from datasets_manifest.recipe.neighbour_ranges import NeighbourRanges
 from datasets_manifest.recipe.receiver_ranges import ReceiverRanges
-from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
+from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, load_rig, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_single_frame_keys, fill_distance
 from datasets_manifest.recipe.tanker_ranges import TankerRanges
 from datasets_manifest.types.appearance import CalibrationBoard
@@ -415,7 +415,7 @@ def parse_recipe(
             pin_environment_map(part["environment"], base or Path())
     if "sensor" in table:
         raise ValueError("sensor: unknown key; it belongs to rig")
-    table["rig"], table["sensor"] = resolve_rig(table.get("rig", "rgb-ideal"), _seed(table))
+    table["rig"], table["sensor"] = resolve_rig(load_rig(table.get("rig", "rgb-ideal"), base), _seed(table))
     try:
         return Recipe.model_validate(table)
     except ValidationError as error:

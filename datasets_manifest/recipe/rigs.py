@@ -5,7 +5,9 @@ The shipped rigs have the seed paper's geometry with three sensors, and ideal or
 
 from __future__ import annotations
 
-from typing import Literal, Self
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -95,6 +97,44 @@ class _RigTable(FrozenModel):
     encoding: str | None = None
     optics: Optics | None = None
     eyes: Eyes | None = None
+
+
+def read_rig_file(text: str, where: str) -> dict[str, Any]:
+    """The table of a rig's own file.
+
+    Args:
+        text: TOML.
+        where: the file, for errors.
+
+    Raises:
+        ValueError: not TOML, or no preset to start from.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{where}: not valid TOML: {error}") from error
+    if "preset" not in table:
+        raise ValueError(f"{where}: preset: name the shipped rig to start from; there are {', '.join(SENSORS)}")
+    return table
+
+
+def load_rig(value: object, base: Path | None = None) -> object:
+    """A rig's name or table as it is, and the table of a `.toml` file that it names.
+
+    Args:
+        value: of the recipe.
+        base: folder that a relative path starts from.
+
+    Raises:
+        ValueError: the file cannot be read.
+    """
+    if not (isinstance(value, str) and value.endswith(".toml")):
+        return value
+    path = (base or Path()) / value
+    try:
+        return read_rig_file(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error
 
 
 def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:

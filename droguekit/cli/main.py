@@ -30,8 +30,12 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
+    "new": Command("droguekit.cli.dataset.new", "Write a commented drogue, rig or recipe to start from."),
     "plan": Command(
         "droguekit.cli.dataset.plan", "Show what a recipe will make, how long it takes and how large it gets."
+    ),
+    "check": Command(
+        "droguekit.cli.dataset.check", "Predict how well a recipe's markers can be measured, and what will fail."
     ),
     "render": Command("droguekit.cli.dataset.render", "Make a dataset from a recipe; continues where it stopped."),
     "merge": Command("droguekit.cli.dataset.merge", "Join shards of a dataset into one."),

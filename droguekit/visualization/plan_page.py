@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +31,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>What {{ name }} will make</title>
+<title>{{ title }}</title>
 <style>
 body { margin: 0 auto; padding: 1.5rem; max-width: 80rem; background: #fff; color: #1c2026;
   font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
@@ -45,7 +45,7 @@ pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.82rem
 </style>
 </head>
 <body>
-<h1>What {{ name }} will make</h1>
+<h1>{{ title }}</h1>
 <p>{{ description }}</p>
 <div class="panels">
 {% for figure in figures %}
@@ -78,7 +78,7 @@ class PlanFigure:
 def plan_figures(recipe: Recipe, planned: RecipePlan) -> Iterator[PlanFigure]:
     """The pictures of a plan; without drogues there are none of distances and boxes."""
     if planned.by_family:
-        yield _figure(
+        yield draw_figure(
             "Pairs by family of conditions",
             "Every family has its share of the scenes, and every scene about as many pairs.",
             lambda axes: _families(axes, planned),
@@ -87,17 +87,17 @@ def plan_figures(recipe: Recipe, planned: RecipePlan) -> Iterator[PlanFigure]:
     if not np.isfinite(drawn.distances_m).any():
         return
     of = "" if len(drawn.indices) == recipe.frames.count else f" Of {len(drawn.indices)} drawn pairs."
-    yield _figure(
+    yield draw_figure(
         "Distance of the drogue",
         f"Planar distance of the rim's centre from the left camera.{_law_note(recipe)}{of}",
         lambda axes: _distances(axes, recipe, planned),
     )
-    yield _figure(
+    yield draw_figure(
         "Size of the drogue's box",
         f"Side of the square with the area of the whole drogue's box, left image.{_chance(recipe, planned)}{of}",
         lambda axes: _sizes(axes, recipe, planned),
     )
-    yield _figure(
+    yield draw_figure(
         "Place of the drogue's box",
         f"Middles of the boxes in the left image, counted in equal cells.{_place_note(recipe, planned)}{of}",
         lambda axes: _places(axes, recipe, planned),
@@ -203,8 +203,8 @@ def _logarithmic(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:
-    """Draw without pyplot, and leave matplotlib's settings unchanged."""
+def draw_figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:
+    """A plot in a page's style, drawn without pyplot and with matplotlib's settings left as they were."""
     with matplotlib.rc_context({"font.family": "sans-serif", "font.size": 10.0}):
         figure = Figure(figsize=_PANEL_IN, dpi=_DPI, layout="constrained")
         FigureCanvasAgg(figure)
@@ -230,13 +230,30 @@ def write_plan_page(recipe: Recipe, planned: RecipePlan, lines: Sequence[str], o
     Raises:
         OSError: it cannot be written.
     """
-    figures = [
+    title = f"What {recipe.name} will make"
+    write_figure_page(title, recipe.description, plan_figures(recipe, planned), lines, out)
+
+
+def write_figure_page(
+    title: str, description: str, figures: Iterable[PlanFigure], lines: Sequence[str], out: Path
+) -> None:
+    """Write a page with pictures and the lines that a command prints; it is replaced as a whole, or not at all.
+
+    Args:
+        title: of the page.
+        description: a sentence below it.
+        figures: the pictures.
+        lines: printed by the command.
+        out: file to write.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    shown = [
         {"title": figure.title, "caption": figure.caption, "data": base64.b64encode(figure.png).decode("ascii")}
-        for figure in plan_figures(recipe, planned)
+        for figure in figures
     ]
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True).from_string(_TEMPLATE)
-    page = template.render(
-        name=recipe.name, description=recipe.description, figures=figures, lines="\n".join(lines) + "\n"
-    )
+    page = template.render(title=title, description=description, figures=shown, lines="\n".join(lines) + "\n")
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(out, page)

@@ -1,0 +1,190 @@
+"""Commented files of a drogue, a rig and a recipe, to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ValidationError
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.rigs import read_rig_file, resolve_rig
+from drogue_models.presets import explain, parse_drogue
+
+# The face is as wide as leaves a margin of these many marker radii on either side of the markers.
+_FACE_MARGIN, _TUBE_SHARE = 2.5, 0.016
+
+_DROGUE = """# A drogue. Use it as `drogue = "{file}"` in a recipe, and look at it with
+# `droguekit model {file} --out drogue.glb`.
+# Lengths are in metres, reflectances from 0 to 1. docs/how-to/add-a-drogue.md explains every key, also those of markers
+# that are no even ring and of bodies such as baskets, leaves and cones.
+name = "{name}"
+
+# Outermost radius, radius of the face's opening, and radius of the tube around the rim.
+rim_radius_m = {rim:g}
+face_inner_radius_m = {inner:g}
+rim_tube_radius_m = {tube:g}
+
+# An even ring of markers. For any other layout write marker_positions_m = [[x, y], ...] instead of these two.
+marker_count = {markers}
+marker_ring_radius_m = {ring:g}
+marker_radius_m = {radius:g}
+
+# Lamps shine with this luminance [cd/m2], 0 stands for paint. By day a clear sky has 2000 to 10,000 cd/m2.
+marker_luminance_cd_m2 = {luminance:g}
+marker_emission_rgb = [1.0, 1.0, 1.0]
+marker_reflectance_rgb = [0.8, 0.8, 0.8]
+"""
+_RIG = """# A stereo rig. Use it as `rig = "{file}"` in a recipe.
+# The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/recipes.md lists them.
+preset = "{preset}"
+
+# Size of an image, focal length over pixel pitch, and distance of the cameras.
+width_px = {width}
+height_px = {height}
+focal_px = {focal:g}
+baseline_m = {baseline:g}
+
+# 8, or 12 in files of 16 bits, which most viewers show as black; `droguekit preview` shows them.
+output_bits = {bits}
+
+[optics]
+pixel_pitch_um = 3.75
+
+# Real lenses: Brown-Conrady coefficients. Without this table the lenses are ideal.
+# [eyes]
+# k1 = -0.12
+# k2 = 0.05
+# p1 = 0.0003
+# p2 = -0.0002
+"""
+_RECIPE = """# A recipe. `droguekit check {file}` predicts how well the markers can be measured,
+# `droguekit plan {file}` how long it takes, and `droguekit render {file} --out data/{name}` makes it.
+# docs/reference/recipes.md explains every key.
+name = "{name}"
+drogue = "{drogue}"
+rig = "{rig}"
+
+[frames]
+count = {pairs}
+scenes = {scenes}
+
+# Distance of the rim's centre: all sizes in the image equally likely.
+[distance]
+law = "log-uniform"
+low_m = {low:g}
+high_m = {high:g}
+
+# By day: elevation of the sun. -4 is dusk, -18 night.
+[environment]
+sun_elevation_deg = {{ low = 10.0, high = 60.0 }}
+
+# `mitsuba` traces paths; `analytic` draws flat drogues quickly, without a path tracer.
+[render]
+engine = "mitsuba"
+"""
+
+
+@dataclass(frozen=True)
+class FileChoices:
+    """The numbers of a new file, as the command's options name them.
+
+    Attributes:
+        rim_radius_m, markers, marker_radius_m, luminance_cd_m2: of a drogue.
+        preset, size, focal_px, baseline_m, bits: of a rig.
+        drogue, rig, distance, pairs: of a recipe.
+    """
+
+    rim_radius_m: float = 0.305
+    markers: int = 8
+    marker_radius_m: float = 0.01
+    luminance_cd_m2: float = 0.0
+    preset: str = "mono"
+    size: str = "1280x960"
+    focal_px: float = 2133.3
+    baseline_m: float = 0.12
+    bits: int = 8
+    drogue: str = "red-8"
+    rig: str = "mono"
+    distance: str = "5:40"
+    pairs: int = 100
+
+
+def write_new_file(kind: Literal["drogue", "rig", "recipe"], out: Path, choices: FileChoices) -> None:
+    """Write a commented file, after checking that it can be used.
+
+    Raises:
+        ValueError: the file exists, or numbers that do not fit together; names the key.
+        OSError: it cannot be written.
+    """
+    if out.suffix != ".toml":
+        raise ValueError(f"--out: must be a .toml file, got {out}")
+    if out.exists():
+        raise ValueError(f"--out: {out} is there already; name another file, or delete this one")
+    text = {"drogue": _drogue_text, "rig": _rig_text, "recipe": _recipe_text}[kind](out, choices)
+    if kind == "drogue":
+        try:
+            parse_drogue(text, out.parent)
+        except ValidationError as error:
+            raise ValueError(f"new drogue: {explain(error)}") from error
+    elif kind == "rig":
+        resolve_rig(read_rig_file(text, str(out)))
+    else:
+        parse_recipe(text, out.parent)
+    write_text_atomic(out, text)
+
+
+def _name(out: Path) -> str:
+    return "".join(each if each.isalnum() else "-" for each in out.stem.lower()).strip("-") or "mine"
+
+
+def _drogue_text(out: Path, choices: FileChoices) -> str:
+    rim, radius = choices.rim_radius_m, choices.marker_radius_m
+    tube = round(_TUBE_SHARE * rim, 4)
+    ring = rim - tube - _FACE_MARGIN * radius
+    return _DROGUE.format(
+        file=out.name,
+        name=_name(out),
+        rim=rim,
+        inner=round(ring - _FACE_MARGIN * radius, 4),
+        tube=tube,
+        markers=choices.markers,
+        ring=round(ring, 4),
+        radius=radius,
+        luminance=choices.luminance_cd_m2,
+    )
+
+
+def _rig_text(out: Path, choices: FileChoices) -> str:
+    width, _, height = choices.size.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {choices.size!r}")
+    return _RIG.format(
+        file=out.name,
+        preset=choices.preset,
+        width=width,
+        height=height,
+        focal=choices.focal_px,
+        baseline=choices.baseline_m,
+        bits=choices.bits,
+    )
+
+
+def _recipe_text(out: Path, choices: FileChoices) -> str:
+    low, _, high = choices.distance.partition(":")
+    try:
+        low_m, high_m = float(low), float(high)
+    except ValueError as error:
+        raise ValueError(f"--distance: must be NEAR:FAR in metres, such as 5:60, got {choices.distance!r}") from error
+    return _RECIPE.format(
+        file=out.name,
+        name=_name(out),
+        drogue=choices.drogue,
+        rig=choices.rig,
+        pairs=choices.pairs,
+        scenes=max(1, choices.pairs // 10),
+        low=low_m,
+        high=high_m,
+    )

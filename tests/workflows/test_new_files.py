@@ -1,0 +1,63 @@
+"""Files that `droguekit new` writes are read back with the numbers that were asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe.recipe import load_recipe
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+
+
+def test_a_recipe_of_a_new_drogue_and_a_new_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    drogue = ["--markers", "12", "--marker-radius", "0.01", "--luminance", "20000", "--rim-radius", "0.305"]
+    rig = ["--size", "1920x1200", "--focal-px", "1739.13", "--baseline", "0.25", "--bits", "12"]
+    recipe = ["--drogue", "basket.toml", "--rig", "acme-rig.toml", "--distance", "5:60", "--pairs", "20"]
+    for kind, out, options in (("drogue", "basket", drogue), ("rig", "acme-rig", rig), ("recipe", "acme", recipe)):
+        assert run(["new", kind, "--out", f"{out}.toml", *options]) == DONE
+        assert f"`{out}.toml`" in (text := Path(f"{out}.toml").read_text()) or f"{out}.toml" in text
+    read = load_recipe("acme.toml").recipe
+    assert (read.drogue.marker_count, read.drogue.marker_radius_m, read.drogue.rim_radius_m) == (12, 0.01, 0.305)
+    assert read.drogue.marker_luminance_cd_m2 == 20000
+    assert (read.rig.camera.width_px, read.rig.camera.height_px, read.rig.baseline_m) == (1920, 1200, 0.25)
+    assert np.isclose(read.rig.camera.fx_px, 1739.13)
+    assert read.sensor.output_bits == 12
+    assert (read.distance.low_m, read.distance.high_m, read.frames.count) == (5, 60, 20)
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["drogue", "--markers", "40"], "marker_count: must be a whole number from 3 to 32, got 40"),
+        (["drogue", "--marker-radius", "0.1"], "new drogue:"),
+        (["rig", "--size", "1920"], "--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got '1920'"),
+        (["rig", "--preset", "acme"], "no rig named 'acme'; there are rgb-ideal"),
+        (["rig", "--bits", "10"], "output_bits"),
+        (["recipe", "--distance", "far"], "--distance: must be NEAR:FAR in metres, such as 5:60, got 'far'"),
+        (["recipe", "--rig", "none.toml"], "none.toml: cannot be read"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_told_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str
+) -> None:
+    assert run(["new", *command, "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert message in told
+    assert len(told.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.toml").write_text("mine")
+    assert run(["new", "rig", "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+    assert "is there already" in capsys.readouterr().err
+    assert (tmp_path / "mine.toml").read_text() == "mine"
+
+
+def test_a_rig_file_without_a_preset_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.toml").write_text("width_px = 640\n")
+    assert run(["new", "recipe", "--rig", "rig.toml", "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+    assert "rig.toml: preset: name the shipped rig to start from" in capsys.readouterr().err

@@ -1,0 +1,122 @@
+"""The check of a recipe against what is rendered and measured, and what it advises."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe.recipe import parse_recipe
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.workflows.recipe_check import RecipeCheck, check_recipe
+
+BASKET = """name = "basket"
+rim_radius_m = 0.305
+face_inner_radius_m = 0.25
+rim_tube_radius_m = 0.005
+marker_count = {count}
+marker_ring_radius_m = 0.28
+marker_radius_m = {radius}
+marker_luminance_cd_m2 = {luminance}
+marker_emission_rgb = [1.0, 1.0, 1.0]
+marker_reflectance_rgb = [{paint}, {paint}, {paint}]
+"""
+RECIPE = """name = "mine"
+drogue = "basket.toml"
+[rig]
+preset = "mono"
+width_px = 640
+height_px = 480
+focal_px = 1700.0
+output_bits = {bits}
+[frames]
+count = 4
+scenes = 1
+[distance]
+law = "log-uniform"
+low_m = 6.0
+high_m = {high}
+"""
+
+
+def written(folder: Path, luminance: float = 20000.0, radius: float = 0.01, **changes: object) -> Path:
+    values = {"count": 12, "bits": 8, "high": 40.0, "paint": 0.8} | changes
+    (folder / "basket.toml").write_text(BASKET.format(luminance=luminance, radius=radius, **values))
+    (folder / "mine.toml").write_text(RECIPE.format(**values))
+    return folder / "mine.toml"
+
+
+def checked(file: Path) -> RecipeCheck:
+    return check_recipe(parse_recipe(file.read_text(), file.parent))
+
+
+def test_size_and_light_follow_the_laws_of_a_pinhole_and_a_lamp(tmp_path: Path) -> None:
+    check = checked(written(tmp_path))
+    for light in ("day", "dusk", "night"):
+        rows = check.of_light(light)
+        assert [rows[0].distance_m, rows[-1].distance_m] == [6.0, 40.0]
+        assert np.allclose([row.radius_px * row.distance_m for row in rows], 17.0)
+        # The depth of a ring head on is as good as its centres, and falls with the square of the distance.
+        depths = [row.z_sigma_m / row.centroid_sigma_px / row.distance_m**2 for row in rows]
+        assert np.allclose(depths, depths[-1], rtol=0.02)  # the ring's radius over the distance, squared
+    day, dusk, night = check.lights
+    assert day.sky_cd_m2 > 1000 * dusk.sky_cd_m2 > 1000 * night.sky_cd_m2
+    # By night only the lamp itself shines.
+    assert night.marker_cd_m2 == pytest.approx(20000.0, rel=1e-6)
+    assert day.marker_cd_m2 > 20000.0
+
+
+def test_more_noise_a_larger_error(tmp_path: Path) -> None:
+    """The error of a centre falls as the inverse of signal over noise where nothing is clipped."""
+    bright, dim = (checked(written(tmp_path, luminance)).of_light("day")[-3:] for luminance in (20000.0, 5000.0))
+    for one, other in zip(bright, dim, strict=True):
+        assert one.snr > other.snr
+        assert one.centroid_sigma_px is not None
+        assert other.centroid_sigma_px is not None
+        assert one.centroid_sigma_px < other.centroid_sigma_px
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"luminance": 2000.0, "paint": 0.02},
+            r"lamps are darker than the sky by day, [\d,]+ against [\d,]+ cd/m2: use [\d,]+ cd/m2 or",
+        ),
+        ({"luminance": 0.0}, r"markers are below 5 deviations of the noise at night from 6 m on: use [\d,]+ cd/m2"),
+        ({"radius": 0.003}, r"markers are below 0.3 px radius from 1[0-9.]+ m on: use a radius of 0.008 m"),
+        ({"count": 3}, r"3 markers leave no spare one"),
+        ({"bits": 12}, r"12 bits in files of 16, which most viewers show as black"),
+        ({"count": 32, "radius": 0.004, "high": 60.0}, r"neighbouring markers merge from [345][0-9.]+ m on"),
+        ({"high": 200.0}, r"the rim is below 16 px from 83.2 m on"),
+        ({"luminance": 300000.0}, r"lamps are brighter than the sensor's range at night up to 40 m"),
+    ],
+)
+def test_what_will_fail_is_told_with_what_to_change(tmp_path: Path, changes: dict[str, float], message: str) -> None:
+    advice = "\n".join(checked(written(tmp_path, **changes)).advice)
+    assert re.search(message, advice), advice
+
+
+def test_the_command_writes_numbers_and_one_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    numbers, page = tmp_path / "check.json", tmp_path / "check.html"
+    command = ["check", str(written(tmp_path)), "--engine", "analytic", "--json", str(numbers), "--html", str(page)]
+    assert run(command) == DONE
+    told = capsys.readouterr().out
+    assert "what will fail, and what to change" in told or "nothing will fail" in told
+    content = json.loads(numbers.read_text())
+    assert content["schema"] == 1
+    assert {row["light"] for row in content["markers"]} == {"day", "dusk", "night"}
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") == 9
+    assert "What to expect of mine" in text
+    assert "http" not in text
+
+
+def test_a_drogue_without_markers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(RECIPE.format(bits=8, high=40.0).replace("basket.toml", "basket-grey"))
+    assert run(["check", str(file)]) == WRONG_INPUT
+    assert "the drogue basket-grey has no markers" in capsys.readouterr().err
