@@ -92,7 +92,7 @@ class LayeredAir:
         direction, offset_m = self._sky.beam.direction, self._environment.camera_offset_m
         share = 1.0
         for layer in self._environment.clouds:
-            share *= 1.0 - opacity_towards(layer, direction, offset_m)
+            share *= 1.0 - opacity_towards(layer, direction, offset_m, self.round_horizon_sine)
         return share * self._mist_beam_share
 
     @property
@@ -157,9 +157,9 @@ class LayeredAir:
         return self._environment.extinction_per_m
 
     @property
-    def highest_ground_sine(self) -> float:
-        """Sine of the elevation of the horizon."""
-        return 0.0
+    def round_horizon_sine(self) -> float | None:
+        """Sine of the elevation of the horizon; None where the ground is level and has none."""
+        return None
 
     def horizon_share(self, directions: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
         """(...) share of each pixel that lies below the horizon; pixels are `angle_rad` wide."""

@@ -90,7 +90,11 @@ class EnvironmentRadiance:
             sky, horizon = self.clear_radiance(directions)
         total = sky.copy()
         layers = sorted(self.environment.clouds, key=lambda layer: -abs(layer.height_above_camera_m))
-        parts = [_rows_with(directions[..., 2] * np.sign(layer.height_above_camera_m) > 0) for layer in layers]
+        lowest = self.air.round_horizon_sine or 0.0
+        parts = [
+            _rows_with(directions[..., 2] * np.sign(layer.height_above_camera_m) > (lowest if layer.is_above else 0.0))
+            for layer in layers
+        ]
         pictures = [
             self._cloud(layer, directions[rows], horizon[rows]) for layer, rows in zip(layers, parts, strict=True)
         ]
@@ -160,8 +164,8 @@ class EnvironmentRadiance:
 
     def _ground_below(self, directions: NDArray[np.float32]) -> float:
         """Vertical component below which pixels show some ground."""
-        horizon = self.air.highest_ground_sine
-        return min(horizon + pixel_angle_rad(directions), 0.0) if horizon < 0 else 0.0
+        horizon = self.air.round_horizon_sine
+        return 0.0 if horizon is None else min(horizon + pixel_angle_rad(directions), 0.0)
 
     def _put_ground(
         self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
@@ -186,7 +190,8 @@ class EnvironmentRadiance:
         many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
         every = _CLOUD_STEP_PX if many else 1
         chosen, behind_air = directions[::every, ::every], air[::every, ::every]
-        seen = render_cloud_layer(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
+        light_on, offset_m = self.air.light_on(layer), self.environment.camera_offset_m
+        seen = render_cloud_layer(layer, chosen, light_on, every, offset_m, self.air.round_horizon_sine)
         light = self.air.before_cloud(seen.radiance, chosen, seen.distance_m, behind_air)
         # Light times opacity is interpolated, because light is undefined where there is no cloud.
         layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)

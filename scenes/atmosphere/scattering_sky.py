@@ -214,7 +214,7 @@ class ScatteringAir(LayeredAir):
         return share
 
     @property
-    def highest_ground_sine(self) -> float:
+    def round_horizon_sine(self) -> float:
         """Sine of the elevation of the horizon."""
         return float(-np.sin(self._dip_rad))
 

@@ -27,6 +27,7 @@ _BODY_SLOPE, _HEAP_SLOPE, _KNOB_SLOPE, _STREAK_SLOPE = 3.0, 2.8, 2.0, 1.5
 _HEAPS_PER_BODY = 3.1
 _KNOBS_PER_BODY = 6.3
 _EARTH_M = 6.371e6
+_FADING_RISE, _FADING_RISE_AT_GROUND = 0.005, 1e-4
 # The patterns repeat along axes at this angle to the flight; otherwise repeats would line up in the view ahead.
 _TURN_COSINE, _TURN_SINE = np.float32(np.cos(0.37)), np.float32(np.sin(0.37))
 
@@ -37,14 +38,20 @@ class CloudDensity:
     Args:
         layer: its description.
         offset_m: of the camera, east and north of the layer's origin. [m]
+        horizon_sine: of the elevation of the ground's horizon, where the Earth is round under the camera too; None
+            for layers that rise towards level rays, above and below.
 
     Attributes:
         layer: its description.
+        least_rise: sine of the elevation towards the layer beyond which rays miss it.
+        fading_rise: how far above `least_rise` it reaches its full opacity.
         extinction_per_m: inside the cloud. [1/m]
         steepness: slope of density over excess, up to full density.
     """
 
-    def __init__(self, layer: CloudLayer, offset_m: tuple[float, float] = (0.0, 0.0)) -> None:
+    def __init__(
+        self, layer: CloudLayer, offset_m: tuple[float, float] = (0.0, 0.0), horizon_sine: float | None = None
+    ) -> None:
         self.layer = layer
         self._east_m, self._north_m = np.float32(offset_m[0]), np.float32(offset_m[1])
         self._threshold = np.float32(ndtri(np.clip(1.0 - layer.cover_fraction, 1e-4, 1.0 - 1e-4)))
@@ -53,6 +60,13 @@ class CloudDensity:
         self._base_m = np.float32(base_m)
         self.extinction_per_m = 2.6 * layer.optical_depth / layer.thickness_m
         self.steepness = 2.0
+        self._sinks = horizon_sine is not None and not layer.is_above
+        self.least_rise, self.fading_rise = 0.0, _FADING_RISE
+        if horizon_sine is not None:
+            below = float(np.sqrt(2.0 * abs(layer.height_above_camera_m) / _EARTH_M))
+            self.least_rise = horizon_sine if layer.is_above else below
+            # The ground's horizon cuts off what lies above it.
+            self.fading_rise = _FADING_RISE_AT_GROUND if layer.is_above else _FADING_RISE
 
     def height_fraction(self, z_m: _Field) -> _Field:
         """0 at the layer's base, 1 at its highest tops."""
@@ -70,11 +84,13 @@ class CloudDensity:
     def crossing(self, rise: _Field) -> tuple[_Field, _Field]:
         """Distances at which rays that rise towards the layer enter and leave it, over the round Earth. [m]"""
         near_m = abs(self.layer.height_above_camera_m)
-        steep = np.maximum(rise, 0.0)
+        steep = np.maximum(rise, np.float32(self.least_rise))
+        curve = -2.0 if self._sinks else 2.0
         root = [
-            np.sqrt(steep * steep + np.float32(2.0 * h / _EARTH_M)) for h in (near_m, near_m + self.layer.thickness_m)
+            np.sqrt(np.maximum(steep * steep + np.float32(curve * h / _EARTH_M), np.float32(0.0)))
+            for h in (near_m, near_m + self.layer.thickness_m)
         ]
-        # The roots of h = s rise + s^2 / 2 R, in a form without cancellation for steep rays.
+        # The roots of h = s rise +- s^2 / 2 R, in a form without cancellation for steep rays.
         entry, leave = (
             np.float32(2.0 * h) / (steep + r)
             for h, r in zip((near_m, near_m + self.layer.thickness_m), root, strict=True)
@@ -82,8 +98,8 @@ class CloudDensity:
         return entry, leave
 
     def _height_m(self, directions: NDArray[np.float32], distance_m: _Field) -> _Field:
-        """Height above the level surface through the camera, which curves towards the layer. [m]"""
-        bend = self._sign / np.float32(2.0 * _EARTH_M)
+        """Height above the level surface through the camera. [m]"""
+        bend = (np.float32(1.0) if self._sinks else self._sign) / np.float32(2.0 * _EARTH_M)
         height: _Field = directions[..., 2] * distance_m + bend * distance_m * distance_m
         return height
 

@@ -24,7 +24,6 @@ _DROPLET_ASYMMETRY, _ICE_ASYMMETRY = 0.8, 0.72
 # (Coakley and Chylek 1975, doi:10.1175/1520-0469(1975)032<0409:TTSAIR>2.0.CO;2).
 BACK_SCATTER = 0.11
 _LOWEST_CIRRUS_RISE = 0.08
-_SETTING_RISE = 0.005
 # Standard deviations of the blur at edges and where clouds crowd, and the number of bodies between rays that crowds.
 _EDGE_PX, _MEAN_PX = 0.85, 2.2
 _CROWD_FROM, _CROWD_TO = 0.05, 1.0
@@ -75,6 +74,7 @@ def render_cloud_layer(
     light: CloudLight,
     every: int = 1,
     offset_m: tuple[float, float] = (0.0, 0.0),
+    horizon_sine: float | None = None,
 ) -> CloudLayerView:
     """The layer along (H, W, 3) unit directions in world axes.
 
@@ -84,8 +84,9 @@ def render_cloud_layer(
         light: on the layer.
         every: march only one in so many rays down and across, and those at edges; every ray is shaded.
         offset_m: of the camera, east and north of the layer's origin. [m]
+        horizon_sine: as in `CloudDensity`.
     """
-    density = CloudDensity(layer, offset_m)
+    density = CloudDensity(layer, offset_m, horizon_sine)
     if layer.kind == "cirrus":
         return _render_cirrus(density, directions, light)
     rise = directions[..., 2] * np.float32(np.sign(layer.height_above_camera_m))
@@ -96,7 +97,7 @@ def render_cloud_layer(
     knobs = strength * density.knobs(place)
     frayed = 1.0 - np.exp(-met.depth * np.exp(np.float32(0.9) * np.clip(knobs, -1.0, 1.0)))
     # Far clouds fade at the horizon.
-    opacity = frayed * np.clip(rise / np.float32(_SETTING_RISE), 0.0, 1.0)
+    opacity = frayed * np.clip((rise - np.float32(density.least_rise)) / np.float32(density.fading_rise), 0.0, 1.0)
     return CloudLayerView(
         radiance=_shade(density, directions, (place, knobs, strength, met.towards_sun), light),
         opacity=opacity,
@@ -132,14 +133,18 @@ def band_limited(layered: Radiance, layer: CloudLayer, directions: NDArray[np.fl
 
 
 def opacity_towards(
-    layer: CloudLayer, direction: NDArray[np.float64], offset_m: tuple[float, float] = (0.0, 0.0)
+    layer: CloudLayer,
+    direction: NDArray[np.float64],
+    offset_m: tuple[float, float] = (0.0, 0.0),
+    horizon_sine: float | None = None,
 ) -> float:
     """Share of the sun's or moon's beam that the layer stops on the way to the camera; see `render_cloud_layer`."""
-    if direction[2] * layer.height_above_camera_m <= 0:
+    if direction[2] * layer.height_above_camera_m <= 0 and (horizon_sine is None or not layer.is_above):
         return 0.0
     nothing = np.zeros(3)
     light = CloudLight(direction, nothing, nothing, nothing)
-    return float(render_cloud_layer(layer, direction[None, None].astype(np.float32), light, 1, offset_m).opacity[0, 0])
+    ray = direction[None, None].astype(np.float32)
+    return float(render_cloud_layer(layer, ray, light, 1, offset_m, horizon_sine).opacity[0, 0])
 
 
 def _shade(
@@ -190,7 +195,7 @@ def _render_cirrus(density: CloudDensity, directions: NDArray[np.float32], light
     near_m, _ = density.crossing(rise)
     depth = density.cirrus_depth(directions, near_m)
     opacity = 1.0 - np.exp(-depth / np.maximum(rise, np.float32(_LOWEST_CIRRUS_RISE)))
-    opacity[rise <= 0] = 0.0
+    opacity[rise <= density.least_rise] = 0.0
     cosine = np.einsum("...i,i->...", directions, light.direction.astype(np.float32))
     single = 0.7 * henyey_greenstein(cosine, _ICE_ASYMMETRY) + 0.3 / (4.0 * np.pi) + 0.1 / np.pi
     even = (light.sky_lux + light.ground_lux) / (2.0 * np.pi)

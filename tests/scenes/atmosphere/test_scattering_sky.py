@@ -11,6 +11,7 @@ from scenes.atmosphere.air_layers import AirLayers, aerosol_phase, height_along_
 from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
 from scenes.atmosphere.sky_tables import scattered_into_rays
 from scenes.atmosphere.spectrum import MOLECULE_DEPTH, RGB_WEIGHTS, WAVELENGTH_UM
+from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.ground_view import ground_view
 from scenes.sky.photometry import SOLAR_ILLUMINANCE_LUX, direction_from_angles, hemisphere, luminance
@@ -193,19 +194,51 @@ def test_horizon_by_day_is_bright_and_whitish() -> None:
     assert 1.0 < third[2] / third[0] < 1.7 < middle[2] / middle[0]
 
 
-@pytest.mark.parametrize("cloud_height_m", [1500.0, -1200.0])
-def test_clouds_fade_into_the_sky_at_the_horizon(cloud_height_m: float) -> None:
-    layer = CloudLayer(
-        height_above_camera_m=cloud_height_m, cover_fraction=0.5, feature_size_m=2000, optical_depth=8, texture_seed=1
+def column(lowest_deg: float, highest_deg: float) -> np.ndarray:
+    elevation = np.radians(np.linspace(highest_deg, lowest_deg, 240))[:, None] + np.zeros((1, 3))
+    azimuth = np.radians(150.0) + np.array([0.0, 2e-4, 4e-4])
+    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.stack(rays, axis=-1).astype(np.float32)
+
+
+def test_an_overcast_leaves_no_gap_above_the_ground() -> None:
+    """The layer reaches down to the horizon, which lies 1 degree below level here."""
+    deck = CloudLayer(
+        kind="stratus",
+        height_above_camera_m=800.0,
+        cover_fraction=1.0,
+        feature_size_m=2000,
+        optical_depth=30,
+        texture_seed=1,
     )
-    around = EnvironmentRadiance(environment(clouds=(layer,), visibility_m=15_000.0))
-    azimuth = np.linspace(0, 2 * np.pi, 64)
-    rows = [
-        np.stack([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.full(64, np.sin(e))], axis=-1)
-        for e in np.radians([-0.6, 0.6])
-    ]
-    image = around.radiance(np.array(rows, dtype=np.float32))
-    assert np.isfinite(image).all() and image.min() > 0
+    around = EnvironmentRadiance(environment(altitude_m=1000.0, visibility_m=25_000.0, clouds=(deck,)))
+    light = luminance(around.radiance(column(-1.5, 3.0)))[:, 1]
+    # The clear sky there is five times as bright as the air under the deck.
+    assert light.max() < 1.3 * light[0]
+
+
+def test_a_deck_below_ends_at_a_horizon_of_its_own() -> None:
+    """1500 m below, a level deck of a round Earth is seen up to sqrt(2 h / R) = 1.24 degrees below level."""
+    deck = CloudLayer(
+        kind="stratus",
+        height_above_camera_m=-1500.0,
+        cover_fraction=1.0,
+        feature_size_m=2000,
+        optical_depth=30,
+        texture_seed=1,
+    )
+    rays = column(-3.0, 0.5)
+    light = CloudLight(np.array([0.0, 0.0, 1.0]), np.ones(3), np.ones(3), np.ones(3))
+    seen = render_cloud_layer(deck, rays, light, horizon_sine=-0.03)
+    elevation_deg = np.degrees(np.arcsin(rays[:, 1, 2]))
+    opaque = seen.opacity[:, 1] > 0.5
+    # It becomes opaque over 0.29 degrees.
+    assert elevation_deg[opaque].max() == pytest.approx(-1.24 - 0.14, abs=0.06)
+    assert np.all(seen.opacity[elevation_deg > -1.2] == 0.0)
+    near = seen.distance_m[-1, 1]
+    # The top of the deck 3 degrees down: h = s sin e - s^2 / 2 R, and somewhat farther, for its top is uneven.
+    expected = 1500.0 / np.sin(np.radians(3.0))
+    assert expected < near < 1.5 * expected
 
 
 @pytest.mark.parametrize("altitude_m", [30.0, 3000.0, 12_000.0])
