@@ -23,12 +23,14 @@ from render.mitsuba_engine.paths.rays import FrameRays, StratifiedSamples, chunk
 from render.mitsuba_engine.paths.received_light import matt_points, trace_received
 from render.mitsuba_engine.paths.surface_cells import SurfaceCells
 from render.mitsuba_engine.paths.surface_light import SurfaceLight
-from render.mitsuba_engine.render_noise import MOST_COUNT
+from render.mitsuba_engine.render_noise import MOST_COUNT, NoiseBudget
 from render.mitsuba_engine.trace_request import DROGUE_PARTS
 
 # Step of the lattice over the smoothing of the other drogues, and in the image where these are far away: the light is
 # blurred as much as theirs.
 _STEPS_PER_SMOOTHING, _LEAST_STEP_PX = 2.5, 1.6
+# White cloth in the sun takes so many paths that its light is averaged over so many times the step.
+_MANY_PATHS, _WIDER = 4_000_000, 1.5
 # Share of the squared noise that is aimed at which the light may have: more than half, as its paths take most time.
 _LIGHT_SHARE = 0.6
 # The error falls with the number of paths to about this power: few gain more by stratification, many less.
@@ -58,13 +60,21 @@ class DenoisedBodyPaths(DenoisedPaths):
         interior_light = self._interior_light(light, interior)
         budget = self._budget(light, compositor, edges, (interior, interior_light), _EACH_PART)
         if budget.light_error.sum() > LEAST_TIMES * _LIGHT_SHARE * budget.aim:
-            most = MOST_TIMES * self._paths_where_hidden() * len(pixel)
-            paths = _paths_by_part(first, light.centers_of_part, budget.light_error, _LIGHT_SHARE * budget.aim, most)
-            before = light.squared_error()
-            light.trace_parts(paths, self._settings.max_depth)
+            self._trace_more_of(light, first, budget)
             interior_light = self._interior_light(light, interior)
-            budget.light_error *= light.squared_error() / np.maximum(before, 1e-30)
         return light, interior_light, budget.edge_counts(self._settings.edge_samples_per_px)
+
+    def _trace_more_of(self, light: SharedLight, first: NDArray[np.int64], budget: NoiseBudget) -> None:
+        """Trace as many paths as leave the light's share of the noise; update the budget."""
+        aim, most = _LIGHT_SHARE * budget.aim, MOST_TIMES * self._paths_where_hidden() * len(light.pixel)
+        before = light.squared_error()
+        paths = _paths_by_part(first, light.centers_of_part, budget.light_error, aim, most)
+        if 2 * paths @ light.centers_of_part > _MANY_PATHS:
+            light.widen(_WIDER)
+            error = budget.light_error * light.squared_error() / np.maximum(before, 1e-30)
+            paths = _paths_by_part(first, light.centers_of_part, error, aim, most)
+        light.trace_parts(paths, self._settings.max_depth)
+        budget.light_error *= light.squared_error() / np.maximum(before, 1e-30)
 
 
 def _paths_by_part(
@@ -110,11 +120,13 @@ class SharedLight(SurfaceLight):
         self._points = matt_points(surface, dr.gather(mi.Float, rays.lights.open_to_sky, shape))
         # Otherwise each use of them would trace the rays again.
         dr.eval(self._points)
-        step_m = np.maximum(_STEPS_PER_SMOOTHING * np.array(self._smoothing_m), np.float32(least_step_m))
-        self._neighbours = SurfaceCells(
-            self._part_of_row, rows_of(self._points.place), rows_of(self._points.normal), step_m
-        )
+        self._step_m = np.maximum(_STEPS_PER_SMOOTHING * np.array(self._smoothing_m), np.float32(least_step_m))
+        self._neighbours = self._cells_of(self._step_m)
         self.centers_of_part: NDArray[np.int64] = np.bincount(self._part_of_row, minlength=256)
+
+    def _cells_of(self, step_m: NDArray[np.float32]) -> SurfaceCells:
+        place, normal = rows_of(self._points.place), rows_of(self._points.normal)
+        return SurfaceCells(self._part_of_row, place, normal, step_m)
 
     def trace_parts(self, paths: NDArray[np.int64], max_depth: int) -> None:
         """Trace and smooth the light; it replaces the light so far.
@@ -123,10 +135,18 @@ class SharedLight(SurfaceLight):
             paths: (256,) from each centre on a part, for each of two estimates.
             max_depth: longest path in segments.
         """
-        counts = paths[self._part_of_row]
-        both = np.concatenate([self._row_means(counts, max_depth) for _ in range(2)], axis=1)
+        self._counts = paths[self._part_of_row]
+        self._traced = np.concatenate([self._row_means(self._counts, max_depth) for _ in range(2)], axis=1)
+        self._smooth_traced()
+
+    def widen(self, times: float) -> None:
+        """Smooth the light over so many times the step of the lattice."""
+        self._neighbours = self._cells_of(self._step_m * np.float32(times))
+        self._smooth_traced()
+
+    def _smooth_traced(self) -> None:
         halves = np.zeros((2, self._none + 257, 4), dtype=np.float32)
-        halves[:, : self._none, :3] = np.stack(np.split(self._neighbours.means(both, counts), 2, axis=1))
+        halves[:, : self._none, :3] = np.stack(np.split(self._neighbours.means(self._traced, self._counts), 2, axis=1))
         self._keep(halves)
 
     def squared_error(self) -> Array:
