@@ -66,7 +66,7 @@ class ImageProcessing(FrozenModel):
         saturation: factor on chroma.
         denoise_sigma_px: blur of the smoothed picture that fine detail is taken from. [px]
         kept_detail_fraction: share of faint detail, and noise, that denoising leaves.
-        denoise_threshold: detail is faint below so many standard deviations of the noise at mid-grey.
+        denoise_threshold: detail is faint below so many standard deviations of the noise at its level.
         sharpen: how much distinct detail is amplified.
         chroma_blur_px: standard deviation of the blur of chroma. [px]
     """

@@ -15,8 +15,7 @@ from datasets_manifest.types.video_camera import ImageProcessing
 from render.camera.sensor_readout import compiled
 
 Plane = NDArray[np.float32]
-_GREY_CARD = 0.18
-_TOP = 255.0
+_LEVELS = 256
 # Cameras know the colours that daylight and lamps have, and correct no others.
 _MOST_GAIN = 1.6
 
@@ -35,14 +34,13 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
         (H, W, 3), or (H, W) of a monochrome camera.
     """
     tables = tone_tables(processing, frame.sensor.adc_bits, frame.sensor.black_level_dn)
-    threshold = processing.denoise_threshold * noise_levels(frame, processing)
-    detail = np.array(
-        [processing.kept_detail_fraction, 1.0 + processing.sharpen, max(threshold, 1e-3) ** 2], dtype=np.float32
-    )
+    detail = np.array([processing.kept_detail_fraction, 1.0 + processing.sharpen], dtype=np.float32)
+    noise = noise_by_level(frame, processing)
+    faint: Plane = np.square(np.maximum(processing.denoise_threshold * noise, 1e-3), dtype=np.float32)
     if frame.is_monochrome:
         luma = tables[1][raw]
         grey = np.empty(raw.shape, np.uint8)
-        _finish_grey(luma, _blurred(luma, processing.denoise_sigma_px), detail, grey)
+        _finish_grey(luma, _blurred(luma, processing.denoise_sigma_px), detail, faint, grey)
         return grey
     code = cv2.COLOR_BayerRGGB2RGB_EA if processing.demosaic == "edge-aware" else cv2.COLOR_BayerRGGB2RGB
     linear = cv2.cvtColor(raw, code)
@@ -50,7 +48,7 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
     _split(linear, tables, np.float32(processing.saturation), luma, blue, red)
     picture = np.empty(linear.shape, np.uint8)
     blue, red = (_blurred_chroma(plane, processing.chroma_blur_px) for plane in (blue, red))
-    _finish(luma, _blurred(luma, processing.denoise_sigma_px), blue, red, detail, picture)
+    _finish(luma, _blurred(luma, processing.denoise_sigma_px), blue, red, detail, faint, picture)
     return picture
 
 
@@ -79,19 +77,20 @@ def metered(processing: ImageProcessing, frame: FrameSpec, raw: Sequence[NDArray
     return processing.model_copy(update=changes)
 
 
-def noise_levels(frame: FrameSpec, processing: ImageProcessing) -> float:
-    """Standard deviation of shot and read noise where the picture is mid-grey, before denoising. [of 255 levels]"""
+def noise_by_level(frame: FrameSpec, processing: ImageProcessing) -> Plane:
+    """(256,) standard deviation of shot and read noise at each level, before denoising. [of 255 levels]"""
     sensor = frame.sensor
-    tables = tone_tables(processing, sensor.adc_bits, sensor.black_level_dn)
-    factor = processing.exposure_factor
-    grey = _GREY_CARD / (factor - (factor - 1.0) * _GREY_CARD)
-    full_e = sensor.full_well_e / frame.exposure.gain
-    noise = np.sqrt(grey * full_e + sensor.read_noise_e**2) / full_e
-    span = 2**sensor.adc_bits - 1 - sensor.black_level_dn
-    low, high = np.interp(
-        sensor.black_level_dn + span * np.array([grey - noise, grey + noise]), np.arange(2**sensor.adc_bits), tables[1]
-    )
-    return float(high - low) / 2.0
+    table = tone_tables(processing, sensor.adc_bits, sensor.black_level_dn)[1]
+    numbers = np.arange(len(table))
+    dn_per_e = (len(table) - 1 - sensor.black_level_dn) * frame.exposure.gain / sensor.full_well_e
+    # The table is flat where it is clipped: the first number of a level is the one that has it.
+    levels, first = np.unique(table, return_index=True)
+    number = np.interp(np.arange(_LEVELS), levels, first)
+    electrons = np.maximum(number - sensor.black_level_dn, 0.0) / dn_per_e
+    noise_dn = dn_per_e * np.sqrt(electrons + sensor.read_noise_e**2)
+    low, high = (np.interp(number + side * noise_dn, numbers, table) for side in (-1, 1))
+    noise: Plane = ((high - low) / 2.0).astype(np.float32)
+    return noise
 
 
 @lru_cache(maxsize=8)
@@ -111,7 +110,7 @@ def tone_tables(processing: ImageProcessing, adc_bits: int, black_level_dn: int)
     level = srgb_from_light(factor * signal / (1.0 + (factor - 1.0) * signal))
     level += processing.contrast * (level * level * (3.0 - 2.0 * level) - level)
     level = processing.black_fraction + (1.0 - processing.black_fraction) * level
-    tables: Plane = (_TOP * np.clip(level, 0.0, 1.0)).astype(np.float32)
+    tables: Plane = ((_LEVELS - 1) * np.clip(level, 0.0, 1.0)).astype(np.float32)
     tables.flags.writeable = False
     return tables
 
@@ -149,22 +148,25 @@ def _split(
 
 
 @compiled
-def _clean(level: np.float32, smooth: np.float32, detail: Plane) -> np.float32:
-    """Luma with faint detail reduced and distinct detail amplified."""
-    kept, sharp, threshold = detail
+def _clean(level: np.float32, smooth: np.float32, detail: Plane, faint: Plane) -> np.float32:
+    """Luma with faint detail reduced and distinct detail amplified; `faint` is the square of their border, by level."""
+    kept, sharp = detail
     fine = level - smooth
-    share = fine * fine / (fine * fine + threshold)
+    border = faint[min(max(int(smooth), 0), faint.size - 1)]
+    share = fine * fine / (fine * fine + border)
     return np.float32(smooth + fine * (kept + (sharp - kept) * share))
 
 
 @compiled
-def _finish(luma: Plane, smooth: Plane, blue: Plane, red: Plane, detail: Plane, picture: NDArray[np.uint8]) -> None:
+def _finish(
+    luma: Plane, smooth: Plane, blue: Plane, red: Plane, detail: Plane, faint: Plane, picture: NDArray[np.uint8]
+) -> None:
     """Fill in the picture."""
     height, width = luma.shape
     low, top, half = np.float32(0.0), np.float32(255.0), np.float32(0.5)
     for row in range(height):
         for column in range(width):
-            y = _clean(luma[row, column], smooth[row, column], detail)
+            y = _clean(luma[row, column], smooth[row, column], detail, faint)
             r, b = y + red[row, column], y + blue[row, column]
             # Rec. 601: Y = 0.299 R + 0.587 G + 0.114 B.
             g = y - np.float32(0.299 / 0.587) * red[row, column] - np.float32(0.114 / 0.587) * blue[row, column]
@@ -174,11 +176,11 @@ def _finish(luma: Plane, smooth: Plane, blue: Plane, red: Plane, detail: Plane, 
 
 
 @compiled
-def _finish_grey(luma: Plane, smooth: Plane, detail: Plane, picture: NDArray[np.uint8]) -> None:
+def _finish_grey(luma: Plane, smooth: Plane, detail: Plane, faint: Plane, picture: NDArray[np.uint8]) -> None:
     """Fill in a monochrome picture."""
     height, width = luma.shape
     low, top, half = np.float32(0.0), np.float32(255.0), np.float32(0.5)
     for row in range(height):
         for column in range(width):
-            y = _clean(luma[row, column], smooth[row, column], detail)
+            y = _clean(luma[row, column], smooth[row, column], detail, faint)
             picture[row, column] = np.uint8(min(max(y, low), top) + half)

@@ -23,7 +23,7 @@ from datasets_manifest.types.video_camera import (
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from render.camera.image_coding import draw_overlay, intra_coded, jpeg, one_field
-from render.camera.image_processing import tone_tables
+from render.camera.image_processing import noise_by_level, tone_tables
 from render.camera.optics import saturation_cd_m2
 from render.camera.sensor import expose, near_infrared
 from render.camera.video_lens import add_bloom, ghosts, see_through, shift_colors
@@ -221,6 +221,18 @@ def test_processing_correlates_noise_as_in_photographs(
     noisy = with_camera(frame, camera, full_well_e=3000.0, responsivity_e_per_lux_s=3000.0)
     pair = expose(noisy, pair_of(flat_light(0.15), noisy))
     assert low <= lag_one(pair.left[..., 1], pair.right[..., 1]) <= high
+
+
+@pytest.mark.parametrize("level", [0.01, 0.15, 0.6])
+def test_noise_is_known_at_every_level(frame: FrameSpec, level: float) -> None:
+    """Against the noise of a monochrome picture that is not denoised."""
+    processing = ImageProcessing(exposure_factor=1.5)
+    camera = VideoCamera(spectrum="grey", processing=processing)
+    noisy = with_camera(frame, camera, full_well_e=3000.0, responsivity_e_per_lux_s=3000.0, read_noise_e=5.0)
+    shown = expose(noisy, pair_of(flat_light(level), noisy)).left[..., 0].astype(float)
+    told = noise_by_level(noisy, processing)[round(shown.mean())]
+    # Rounding to whole levels adds a twelfth; in the dark the curve bends within the noise.
+    assert np.sqrt(shown.var() - 1 / 12) == pytest.approx(told, rel=0.06)
 
 
 def test_both_eyes_and_all_runs_have_the_same_camera_and_noise_of_their_own(frame: FrameSpec) -> None:
