@@ -63,7 +63,7 @@ class ColorBlobDetector:
         if best is None:
             return None
         score = best.count / self._layout.count * max(0.0, 1 - best.rms_fraction)
-        return Detection(_circle_box(best.affine, self._rim_radius_m), score)
+        return Detection(circle_box(best.affine, self._rim_radius_m), score)
 
     def _best_ring(self, channel: Pixels, best: RingMatch | None) -> RingMatch | None:
         """The ring with the most markers over all thresholds of a channel, or `best` where none has more."""
@@ -87,7 +87,7 @@ def _levels(channel: Pixels) -> list[float]:
     return [share * peak for share in _LEVELS if share * peak >= _MIN_LEVEL_DN]
 
 
-def _circle_box(affine: Array, radius_m: float) -> tuple[float, float, float, float]:
+def circle_box(affine: Array, radius_m: float) -> tuple[float, float, float, float]:
     """Bounding box x, y, width, height of the image of a circle around the layout's origin. [px]"""
     half_width, half_height = radius_m * np.hypot(affine[:, 0], affine[:, 1])
     x, y = affine[:, 2]

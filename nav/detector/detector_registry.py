@@ -8,7 +8,7 @@ from pathlib import Path
 from drogue_models.parameters import DrogueParameters
 from nav.detector.detector import Detector
 
-COLOR_BLOB = "color-blob"
+COLOR_BLOB, PEAK_RING = "color-blob", "peak-ring"
 DEFAULT_DETECTOR = "mobile-s"
 # The networks that ship with the package, one file for each name.
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -17,14 +17,14 @@ _SUFFIX = ".onnx"
 
 def detector_names() -> tuple[str, ...]:
     """Names that `open_detector` accepts."""
-    return (COLOR_BLOB, *sorted(file.stem for file in _WEIGHTS.glob(f"*{_SUFFIX}")))
+    return (COLOR_BLOB, PEAK_RING, *sorted(file.stem for file in _WEIGHTS.glob(f"*{_SUFFIX}")))
 
 
 def network_file(name_or_file: str) -> Path | None:
     """The network file of a detector; None for a detector that is not a network, or an unknown name."""
     if name_or_file.endswith(_SUFFIX):
         return Path(name_or_file)
-    return _WEIGHTS / f"{name_or_file}{_SUFFIX}" if name_or_file in detector_names()[1:] else None
+    return _WEIGHTS / f"{name_or_file}{_SUFFIX}" if name_or_file in detector_names()[2:] else None
 
 
 def open_detector(name_or_file: str, drogue: DrogueParameters, threads: int = 1) -> Detector:
@@ -46,6 +46,10 @@ def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DroguePar
         from nav.detector.color_blob import ColorBlobDetector
 
         return ColorBlobDetector
+    if name_or_file == PEAK_RING:
+        from nav.detector.peak_ring import PeakRingDetector
+
+        return PeakRingDetector
     file = network_file(name_or_file)
     if file is None:
         names = ", ".join(detector_names())

@@ -48,7 +48,7 @@ def test_networks_of_the_package_are_known_by_name(tmp_path: Path, monkeypatch: 
     file = write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(320, 256)))
     assert network_file("squares") is None
     monkeypatch.setattr(registry, "_WEIGHTS", file.parent)
-    assert detector_names() == ("color-blob", "squares")
+    assert detector_names() == ("color-blob", "peak-ring", "squares")
     assert network_file("squares") == file
     assert open_detector("squares", DROGUE).name == "squares"
 
