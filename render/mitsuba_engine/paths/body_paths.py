@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP
 from geometry.se3 import Array
 from render.compositing import Compositor
 from render.mitsuba_engine.jit_arrays import jit_array
@@ -28,7 +29,7 @@ from render.mitsuba_engine.trace_request import DROGUE_PARTS
 
 # Step of the lattice over the smoothing of the other drogues, and in the image where these are far away: the light is
 # blurred as much as theirs.
-_STEPS_PER_SMOOTHING, _LEAST_STEP_PX = 2.5, 1.6
+_STEPS_PER_SMOOTHING, _STEPS_ON_MARKERS, _LEAST_STEP_PX = 2.5, 1.0, 1.6
 # White cloth in the sun takes so many paths that its light is averaged over so many times the step.
 _MANY_PATHS, _WIDER = 4_000_000, 1.5
 # Share of the squared noise that is aimed at which the light may have: more than half, as its paths take most time.
@@ -120,7 +121,10 @@ class SharedLight(SurfaceLight):
         self._points = matt_points(surface, dr.gather(mi.Float, rays.lights.open_to_sky, shape))
         # Otherwise each use of them would trace the rays again.
         dr.eval(self._points)
-        self._step_m = np.maximum(_STEPS_PER_SMOOTHING * np.array(self._smoothing_m), np.float32(least_step_m))
+        # Blurred light would move the centroids of markers.
+        self._is_marker = self._part_of_row % INSTANCE_STEP >= FIRST_MARKER_ID
+        steps = np.where(self._is_marker, _STEPS_ON_MARKERS, _STEPS_PER_SMOOTHING).astype(np.float32)
+        self._step_m = np.maximum(steps * np.array(self._smoothing_m), np.float32(least_step_m))
         self._neighbours = self._cells_of(self._step_m)
         self.centers_of_part: NDArray[np.int64] = np.bincount(self._part_of_row, minlength=256)
 
@@ -140,8 +144,8 @@ class SharedLight(SurfaceLight):
         self._smooth_traced()
 
     def widen(self, times: float) -> None:
-        """Smooth the light over so many times the step of the lattice."""
-        self._neighbours = self._cells_of(self._step_m * np.float32(times))
+        """Smooth the light over so many times the step of the lattice, on markers over the same."""
+        self._neighbours = self._cells_of(np.where(self._is_marker, self._step_m, self._step_m * np.float32(times)))
         self._smooth_traced()
 
     def _smooth_traced(self) -> None:
