@@ -1,0 +1,1 @@
+"""Whether sky and air look as they do in photographs, by numbers."""
