@@ -1,6 +1,7 @@
-"""Measures the variety of recipes, and draws sheets of drogues and tankers in four lights.
+"""Measures the variety of recipes and how a detector finds each kind of drogue, and draws sheets in four lights.
 
 `python -m studies.world_variety measure --out out/world-variety world-89 world-real`
+`python -m studies.world_variety detect --detector mobile-s out/world-variety/world-real`
 `python -m studies.world_variety sheets --out out/world-variety`
 """
 
@@ -13,6 +14,7 @@ from pathlib import Path
 from drogue_models.presets import preset_names
 from drogue_models.tankers.tanker import STATIONS
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
+from studies.world_variety.detection_by_drogue import score_by_drogue
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety
 
@@ -31,12 +33,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure.add_argument("recipes", nargs="+", metavar="RECIPE", help="name of a recipe, or a .toml file")
     measure.add_argument("--scenes", type=int, default=200, metavar="N", help="scenes of each recipe (default 200)")
     sheets = commands.add_parser("sheets", help="every drogue and every tanker at four distances in four lights")
+    detect = commands.add_parser("detect", help="a detector's scores by the kind of drogue")
+    detect.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset with its truth")
+    detect.add_argument("--detector", default="mobile-s", metavar="NAME", help="a shipped one, or a file (mobile-s)")
     for command in (measure, sheets):
         command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder; a second run goes on")
         command.add_argument("--workers", type=int, metavar="N", help="processes that render (default: by the machine)")
     options = parser.parse_args(arguments)
     if options.command == "measure":
         _measure(options.recipes, options.scenes, options.out, options.workers)
+    elif options.command == "detect":
+        _detect(options.dataset, options.detector)
     else:
         _draw_sheets(options.out, options.workers)
 
@@ -57,6 +64,13 @@ def _cells(found: Variety) -> str:
         f"{found.pairs} | {found.drogues} | {found.drogue_distance:.3f} | {found.drogue_distance_p10:.3f} | "
         f"{found.tankers} | {found.silhouettes} | {found.probes} | {x_px:.0f}, {y_px:.0f}"
     )
+
+
+def _detect(dataset: Path, detector: str) -> None:
+    print("drogue | images | drogues | AP50 [%] | recall [%] | false boxes")
+    for row in score_by_drogue(dataset, detector):
+        shares = (("-" if share is None else f"{100 * share:.1f}") for share in (row.ap50, row.recall))
+        print(f"{row.kind} | {row.images} | {row.drogues} | {' | '.join(shares)} | {row.false_boxes}")
 
 
 def _draw_sheets(out: Path, workers: int | None) -> None:

@@ -1,0 +1,73 @@
+"""How well a detector finds each kind of drogue in a dataset."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from datasets_manifest.storage.reader import Dataset
+from drogue_models.parameters import DrogueParameters
+from droguekit.scoring.detection.detection_metrics import AT_50, Evaluation, operating_point
+from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
+from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRunner
+from nav.detector.detector_registry import detector_factory
+
+
+class KindScore(NamedTuple):
+    """Scores on all images that show one kind of drogue.
+
+    Attributes:
+        kind: `ring`, or the family of the drogue's body, and whether it has markers; `all`, or `empty` frames.
+        images: number of images.
+        drogues: number of drogues that count in them.
+        ap50: average precision at an overlap of a half; None without drogues.
+        recall: at the detector's threshold; None without drogues.
+        false_boxes: number of boxes from the threshold on that are on no drogue.
+    """
+
+    kind: str
+    images: int
+    drogues: int
+    ap50: float | None
+    recall: float | None
+    false_boxes: int
+
+
+def score_by_drogue(dataset: Path, detector: str) -> Iterator[KindScore]:
+    """Scores of a detector by the kind of drogue, over all splits; the last is of all images.
+
+    Args:
+        dataset: its folder, with its truth.
+        detector: name of one that ships, or an ONNX file.
+
+    Raises:
+        ValueError: no such dataset or detector, a detector without a threshold, or a pair that cannot be read.
+    """
+    runner = DetectorRunner(dataset, detector_factory(detector))
+    if runner.score_threshold is None:
+        raise ValueError(f"{detector}: has no threshold of its own; name a network")
+    truth = read_detection_truth(dataset)
+    evaluation = Evaluation(truth.images, list(runner.boxes(LEAST_SCORE, lambda: None)))
+    if (fault := runner.faults.line()) is not None:
+        raise ValueError(fault)
+    records = Dataset(dataset)
+    kinds = {index: drogue_kind(records.record(index).frame.drogue) for index in records.frame_indices}
+    images: dict[str, list[ImageTruth]] = defaultdict(list)
+    for image in truth.images:
+        images[kinds[image.frame_index]].append(image)
+    for kind, some in [*sorted(images.items()), ("all", list(truth.images))]:
+        matches = evaluation.matches(some)
+        point = operating_point(matches, runner.score_threshold)
+        false_boxes = int(((matches.score >= runner.score_threshold) & ~matches.is_true[AT_50]).sum())
+        ap50 = evaluation.average_precision(some).ap50
+        yield KindScore(kind, len(some), matches.drogues, ap50, point.recall, false_boxes)
+
+
+def drogue_kind(drogue: DrogueParameters | None) -> str:
+    """Kind of the drogue that a frame shows."""
+    if drogue is None:
+        return "empty"
+    family = "ring" if drogue.body is None else drogue.body.family
+    return family if drogue.marker_count else f"{family}, no markers"
