@@ -14,6 +14,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
+from datasets_manifest.importers.bag_chunks import check_chunks
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.ros_images import RosImage, decode_image, message_stamp_ns
 from datasets_manifest.importers.stamp_pairs import match_stamps, smallest_difference_ns
@@ -62,6 +63,10 @@ class RosBag:
             ValueError: not a bag, a damaged one, or topics or time stamps that do not fit.
         """
         self._path = path
+        try:
+            check_chunks(path)
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read as a ROS bag: {error.strerror}") from error
         with self._open() as reader:
             self._topics = topics or _stereo_topics(reader)
             for topic in self._topics:

@@ -14,6 +14,7 @@ from datasets_manifest.storage.storage import Location, join, open_storage
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _LARGEST = "n>1M"
 _TAGS = ("aerial-refuelling", "drogue", "stereo", "6d-pose", "synthetic")
+_PLAIN = {ord("<"): "&lt;", ord("`"): "'", ord("["): "\\["}
 _LIMITS = """\
 * Every image is computed. What the model leaves out, such as rain, ice, heat haze of engines and cloth that flutters,
   is missing, and results on these images do not prove results with a real camera.
@@ -22,6 +23,12 @@ _LIMITS = """\
 * Equal, evenly spaced markers determine the roll only modulo the angle between neighbours; no method can determine
   more.
 * Scenes, not frames, are split: frames of one scene share sky, sun and ground, and are not independent draws."""
+
+
+def plain_line(text: str) -> str:
+    """A text from a recipe or manifest as one line that is neither HTML, nor Markdown's code or links."""
+    line = " ".join(text.split()).translate(_PLAIN)
+    return "".join(character for character in line if character.isprintable())
 
 
 def card_text(manifest: Manifest) -> str:
@@ -45,7 +52,7 @@ def write_card(dataset: Location, manifest: Manifest) -> Location:
 
 def citation(manifest: Manifest) -> str:
     """A BibTeX entry, which identifies the data by their hash."""
-    version = manifest.software.get("droguekit", "")
+    version = plain_line(manifest.software.get("droguekit", "")).replace("{", "(").replace("}", ")")
     return "\n".join(
         [
             f"@misc{{{manifest.name},",
@@ -76,20 +83,20 @@ def card_metadata(manifest: Manifest) -> dict[str, Any]:
 def card_summary(manifest: Manifest) -> str:
     """The dataset's name as a title, what it shows, and the first items of its contents."""
     recipe, camera = manifest.recipe, manifest.recipe.rig.camera
-    counts = manifest.counts
+    counts, sensor = manifest.counts, plain_line(recipe.sensor.name)
     splits = ", ".join(f"{name} {counts.by_split[name]}" for name in ("train", "val", "test"))
     missing = recipe.frames.count - counts.pairs
     gaps = f" {missing} of the recipe's {recipe.frames.count} pairs are not in it." if missing else ""
     return f"""# {manifest.name}
 
-{recipe.description or "Synthetic stereo images of an aerial-refuelling drogue."}
+{plain_line(recipe.description) or "Synthetic stereo images of an aerial-refuelling drogue."}
 
 ## What is in it
 * {counts.pairs} stereo pairs ({2 * counts.pairs} images of {camera.width_px} x {camera.height_px}) of \
 {len(counts.by_scene)} scenes, {counts.empty} of them without a drogue.{gaps}
 * Pairs by split: {splits}.
 * Distance of the drogue: {_distance(recipe.distance)}.
-* Cameras: baseline {recipe.rig.baseline_m:g} m, focal length {camera.fx_px:g} px, sensor `{recipe.sensor.name}`."""
+* Cameras: baseline {recipe.rig.baseline_m:g} m, focal length {camera.fx_px:g} px, sensor `{sensor}`."""
 
 
 def _files(manifest: Manifest) -> str:
@@ -112,8 +119,9 @@ def _files(manifest: Manifest) -> str:
 
 def card_sections(manifest: Manifest) -> str:
     """How the dataset was made, purpose, limits, licence and how to cite it: the sections after its contents."""
-    software = ", ".join(f"{name} {version}" for name, version in sorted(manifest.software.items()))
-    engines = ", ".join(f"{pairs} pairs by {engine}" for engine, pairs in sorted(manifest.engines.items()))
+    licence = plain_line(manifest.data_licence)
+    software = plain_line(", ".join(f"{name} {version}" for name, version in sorted(manifest.software.items())))
+    engines = plain_line(", ".join(f"{pairs} pairs by {engine}" for engine, pairs in sorted(manifest.engines.items())))
     return f"""\
 ## How it was made
 By `droguekit` from `recipe.toml` with seed {manifest.recipe.seed}: {engines or "no pair yet"}.
@@ -129,7 +137,7 @@ Training and testing detectors of the drogue, and measuring the errors of pose e
 {_LIMITS}
 
 ## Licence
-The data are under {manifest.data_licence}: use them for anything, and name where they come from. The program that
+The data are under {licence}: use them for anything, and name where they come from. The program that
 made them has a licence of its own. No image shows a person, a place or somebody else's work.
 
 ## How to cite

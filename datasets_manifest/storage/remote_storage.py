@@ -260,6 +260,7 @@ def _connect(url: str, process: int) -> tuple[Any, str]:
         system, root = url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         raise ValueError(f'{url}: {error.name or error} is missing: pip install "droguekit[remote]"') from error
-    except ValueError as error:
-        raise ValueError(f"{url}: cannot be used as storage: {error}") from error
+    except Exception as error:  # each of fsspec's systems fails in its own way
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{url}: cannot be used as storage: {reason}") from error
     return system, str(root).rstrip("/")

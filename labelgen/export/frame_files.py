@@ -15,6 +15,7 @@ from datasets_manifest.storage.image_codecs import decode_png, encode_png
 from datasets_manifest.storage.layout import image_file
 from datasets_manifest.storage.reader import Dataset, read_shutter
 from datasets_manifest.types.images import Pixels, display_table
+from drogue_models.untrusted_files import open_regular
 from geometry.stereo import Eye
 from labelgen.export.export_log import ExportLog
 
@@ -43,16 +44,21 @@ def link_or_copy(source: Path, target: Path) -> None:
     """Link `target` to `source`, or copy it where the disk does not support hard links.
 
     Raises:
+        ValueError: the source is a link; one that was looked at before may have become one.
         OSError: it cannot be written.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.link(source, target)
+        os.link(source, target, follow_symlinks=False)
     except FileExistsError:
         raise
     except OSError:
         # Another disk, or one without hard links.
-        shutil.copyfile(source, target)
+        with open_regular(source, in_folder=True) as stream, target.open("xb") as copy:
+            shutil.copyfileobj(stream, copy)
+    if target.is_symlink():
+        target.unlink()
+        raise ValueError(f"{source}: leads outside its folder")
 
 
 def export_image(

@@ -6,6 +6,7 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -80,6 +81,12 @@ class OddError(Exception):
     def __init__(self, first, second):
         super().__init__(f"{first} and {second}")
 
+def die_with_a_folder(index):
+    from datasets_manifest.atomic import scratch_folder
+    with scratch_folder() as folder:
+        (folder / "mesh.ply").write_text("mesh")
+        os.kill(os.getpid(), signal.SIGKILL)
+
 def tell_and_wait(pipe, index):
     with open(pipe, "w") as stream:
         stream.write(f"{os.getpid()}\\n")
@@ -119,6 +126,19 @@ def test_a_task_that_always_kills_its_worker_is_given_up_and_the_others_are_done
     assert [attempt.number for attempt in deaths] == list(range(1, MAX_ATTEMPTS + 1))
     assert [attempt.final for attempt in deaths] == [False] * (MAX_ATTEMPTS - 1) + [True]
     assert {attempt.index: attempt.value for attempt in attempts if attempt.final} == {0: 0, 1: None, 2: 4}
+
+
+def test_a_killed_worker_leaves_no_temporary_folder(
+    tasks: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    (scratch / f"droguekit-{os.getpid()}-mine").mkdir()
+    attempts = [*run_tasks(tasks.die_with_a_folder, [0], workers=1)]
+    assert len(attempts) == MAX_ATTEMPTS
+    assert [path.name for path in scratch.iterdir()] == [f"droguekit-{os.getpid()}-mine"]
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -73,6 +73,9 @@ def test_a_wrong_recipe_names_file_and_key(change: tuple[str, str], message: str
         (["--frames", "five"], r"--frames: must be A:B"),
         (["--workers", "-2"], r"workers: must not be negative, got -2"),
         (["--engine", "povray"], r"engine: no engine named 'povray'"),
+        (["--timeout", "inf"], r"--timeout: must be above 0 s and at most 1e\+06 s, got inf"),
+        (["--timeout", "nan"], r"--timeout: must be above 0 s and at most 1e\+06 s, got nan"),
+        (["--timeout", "0"], r"--timeout: must be above 0 s"),
     ],
 )
 def test_wrong_options_of_render(arguments: list[str], message: str, tmp_path: Path) -> None:

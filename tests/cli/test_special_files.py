@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import pytest
 from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.reader import Dataset
-from droguekit.cli.main import FAULT, WRONG_INPUT, run
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import StereoRig
 from labelgen.validation.dataset_checks import validate_dataset
@@ -127,3 +128,26 @@ def test_files_of_an_import(tmp_path: Path, replace: Replace) -> None:
     replace(tmp_path / "in" / "left" / "1.png")
     assert "left" in refusal(*command)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_label_at_the_end_of_all_floats_is_drawn_outside(dataset: Path, tmp_path: Path) -> None:
+    for index in range(3):
+        path = frame_folder(dataset, index) / "record.json"
+        table = json.loads(path.read_text())
+        for view in table["views"].values():
+            for marker in view["markers"]:
+                marker["center_ellipse_px"] = marker["center_proj_px"] = [1e308, -1e308]
+            if view["box_visible_xywh_px"] is not None:
+                view["box_visible_xywh_px"] = [-1e308, 0.0, 1e308, 1e308]
+        path.write_text(json.dumps(table))
+    with redirect_stdout(io.StringIO()):
+        assert run(["preview", str(dataset), "--out", str(tmp_path / "sheet.png")]) == DONE
+    assert (tmp_path / "sheet.png").stat().st_size > 0
+
+
+def test_a_number_of_many_digits_is_named_with_its_file(dataset: Path, tmp_path: Path) -> None:
+    path = frame_folder(dataset, 1) / "record.json"
+    path.write_text(path.read_text().replace('"frame_index":1', '"frame_index":' + "1" * 5000))
+    assert "record.json: is truncated or not JSON: has a number of 5000 digits" in refusal(
+        "preview", dataset, "--out", tmp_path / "sheet.png"
+    )

@@ -135,3 +135,29 @@ def test_a_dataset_without_pairs_is_described_too(tmp_path: Path) -> None:
     manifest = read_manifest(tmp_path)
     assert "* 0 stereo pairs" in card_text(manifest)
     assert len(describe_croissant(tmp_path, manifest)["distribution"]) == 6
+
+
+def test_hostile_texts_change_nothing_but_themselves(described: Path) -> None:
+    """Texts of recipe and manifest are one line each, and neither HTML nor Markdown of their own."""
+    manifest = read_manifest(described)
+    evil = "x\n---\n\n## Licence\nMIT <script>alert(1)</script> ```\n[here](javascript:alert) \x1b[2J\u202e}\n"
+    sensor = manifest.recipe.sensor.model_copy(update={"name": evil})
+    recipe = manifest.recipe.model_copy(update={"description": evil, "sensor": sensor})
+    changes = {"software": {"droguekit": evil}, "engines": {evil: 3}, "data_licence": evil, "recipe": recipe}
+    hostile = manifest.model_copy(update=changes)
+    text, before = card_text(hostile), card_text(manifest)
+    assert re.findall(r"^(?:#|---|```).*$", text, re.MULTILINE) == re.findall(
+        r"^(?:#|---|```).*$", before, re.MULTILINE
+    )
+    assert front_matter(text)["license"] == evil.lower()
+    _, text = text.split("\n---\n", 1)
+    assert (
+        "<script" not in text
+        and "\x1b" not in text
+        and "\u202e" not in text
+        and not re.search(r"(?<!\\)\[[^\]]*\]\(", text)
+    )
+    assert len(citation(hostile).splitlines()) == len(citation(manifest).splitlines())
+    assert citation(hostile).count("{") == citation(hostile).count("}") == citation(manifest).count("}")
+    table = json.loads(json.dumps(describe_croissant(described, hostile)))
+    assert table["description"] == evil and table["@type"] == "sc:Dataset"

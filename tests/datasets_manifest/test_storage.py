@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.frame_store import FrameStore, list_frames, shard_numbers
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.storage.storage import absolute, as_location, join, map_in_order, open_storage
+from datasets_manifest.storage.storage import LocalStorage, absolute, as_location, join, map_in_order, open_storage
 from datasets_manifest.storage.writer import (
     encode_files,
     encode_record,
@@ -22,6 +24,7 @@ from datasets_manifest.storage.writer import (
     remove_leftovers,
     write_frame,
 )
+from labelgen.export.frame_files import link_or_copy
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -213,3 +216,41 @@ def test_work_comes_back_in_order_and_errors_in_their_turn(place: Path | str) ->
     assert [next(results) for _ in range(50)] == [1 / (50 - number) for number in range(50)]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+@pytest.mark.parametrize("url", ["reference://x", "foo://x", "zip://x::/no/such/file.zip"])
+def test_urls_that_are_no_storage_are_named(url: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(url)}: cannot be used as storage: .+$"):
+        open_storage(url)
+
+
+@pytest.mark.parametrize(
+    "name", ["\u0663", "\u0660" * 6, "7", "0000007", "1" * 5000, "-00001", "+00001", "00 001", "1e5"]
+)
+def test_stray_names_are_no_frames(name: str, tmp_path: Path) -> None:
+    """Digits of other scripts, other spellings of a number, and numbers that are too long for Python."""
+    assert layout.frame_of_name(name) is None
+    assert layout.frame_of_name("000007") == 7 and layout.frame_of_name("1234567") == 1234567
+    if len(name) > 255:
+        return
+    (tmp_path / "frames" / name).mkdir(parents=True)
+    (tmp_path / "frames" / name / "record.json").touch()
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards" / f"{name}.tar").touch()
+    assert list_frames(tmp_path) == layout.frame_indices(tmp_path) == shard_numbers(LocalStorage(tmp_path)) == []
+
+
+def test_a_file_that_is_swapped_for_a_link_after_it_was_looked_at_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "dataset" / "frames" / "000000"
+    folder.mkdir(parents=True)
+    (tmp_path / "secret").write_text("secret")
+    (folder / "left.png").symlink_to(tmp_path / "secret")
+    # What a look at the file said before somebody swapped it.
+    monkeypatch.setattr(LocalStorage, "leads_outside", lambda *_: False)
+    with pytest.raises(ValueError, match=r"left\.png: cannot be read: leads outside its folder"):
+        FrameStore(tmp_path / "dataset").read(0, "left.png")
+    with pytest.raises(ValueError, match=r"left\.png: leads outside its folder"):
+        link_or_copy(folder / "left.png", tmp_path / "out" / "left.png")
+    assert not (tmp_path / "out" / "left.png").is_symlink() and not (tmp_path / "out" / "left.png").exists()

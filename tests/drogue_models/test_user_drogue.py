@@ -163,6 +163,8 @@ def test_unfit_meshes_are_refused(tmp_path: Path, spoil: Callable[[trimesh.Trime
     [
         ("body.ply", b"not a mesh", "cannot be read as ply"),
         ("body.txt", b"x", "of a kind that cannot be read; use one of .*ply"),
+        ("body.zip", b"PK", "of a kind that cannot be read; use one of dxf, glb"),
+        ("body.bz2", b"BZh", "of a kind that cannot be read; use one of dxf, glb"),
         ("body.stl", b"solid empty\nendsolid empty\n", "body.stl"),
     ],
 )

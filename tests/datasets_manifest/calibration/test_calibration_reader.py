@@ -238,3 +238,42 @@ def test_millimetres_are_scaled(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"120\.\d+ m is not a plausible baseline"):
         read_calibration([path])
     check_rig(read_calibration([path], unit_m=1e-3).rig, R1)
+
+
+DEEP = 100_000
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("storage.yaml", "%YAML:1.0\n---\nM1: !!opencv-matrix\n" + "[" * DEEP),
+        ("storage.yaml", "%YAML:1.0\n---\nM1: !!opencv-matrix\n" + "- " * DEEP + "1"),
+        ("storage.yaml", "%YAML:1.0\n---\n" + "".join(f"{' ' * depth}a: # !!opencv-matrix\n" for depth in range(900))),
+        ("storage.xml", '<?xml version="1.0"?>\n<opencv_storage>\n' + "<a>" * DEEP),
+        ("storage.json", '{"a":' * DEEP),
+        ("plain.yaml", "a: " + "{a: " * DEEP),
+        ("plain.yaml", "? " * DEEP),
+    ],
+)
+def test_calibrations_nested_too_deep_are_refused(name: str, text: str, tmp_path: Path) -> None:
+    """Without a limit the parsers overflow their stack, which ends the process."""
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=f"{name}: is nested too deep for a calibration"):
+        read_calibration([tmp_path / name])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: &a [*a]\n",
+        "a: &a [1, 1, 1, 1, 1, 1, 1, 1]\n"
+        + "".join(
+            f"{this}: &{this} [{', '.join([f'*{before}'] * 8)}]\n" for before, this in ["ab", "bc", "cd", "de", "ef"]
+        )
+        + "g: [*f, *f, *f, *f]\n",
+    ],
+)
+def test_references_that_stand_for_too_much_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "bomb.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"bomb\.yaml: is not YAML: stands for more than 100000 values"):
+        read_calibration([tmp_path / "bomb.yaml"])

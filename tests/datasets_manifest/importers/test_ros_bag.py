@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
 import io
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 
+from datasets_manifest.importers.bag_chunks import check_chunks, zstd
 from datasets_manifest.importers.ros_bag import RosBag
 from datasets_manifest.importers.ros_images import decode_image
 from tests.support.ros_messages import (
@@ -302,3 +306,65 @@ def test_names_of_encodings(encoding: str, is_read: bool) -> None:
     else:
         with pytest.raises(ValueError, match=f"a: encoding '{encoding}' is not read; use rgb8"):
             decode_image(message, "a")
+
+
+def flipped(data: bytes, place: int) -> bytes:
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
+@pytest.mark.parametrize("is_chunked", [True, False])
+def test_a_flipped_bit_in_an_image_is_named(compression: str, is_chunked: bool, tmp_path: Path) -> None:
+    """In a file with checksums, as the writer of the MCAP project makes it; flipped bits look like noise."""
+    writing = pytest.importorskip("mcap.writer")
+    stream, images = io.BytesIO(), [bytes([value]) * 3000 for value in (7, 200)]
+    options = {"compression": writing.CompressionType[compression], "use_chunking": is_chunked}
+    writer = writing.Writer(stream, enable_crcs=True, enable_data_crcs=True, **options)
+    writer.start("ros2")
+    channel = writer.register_channel("/left/image_raw", "cdr", writer.register_schema(IMAGE, "ros2msg", b""))
+    for place, data in enumerate(images):
+        writer.add_message(channel, log_time=place, data=data, publish_time=place)
+    writer.finish()
+    path, data = tmp_path / "flight.mcap", stream.getvalue()
+    path.write_bytes(data)
+    check_chunks(path)
+    place = data.index(images[0]) + 1500 if compression == "NONE" or not is_chunked else 8 + len(data) // 4
+    path.write_bytes(flipped(data, place))
+    with pytest.raises(ValueError, match=r"flight\.mcap: is (damaged: |truncated or damaged)"):
+        check_chunks(path)
+
+
+def chunk_of_mcap(compression: bytes, size: int, body: bytes) -> bytes:
+    record = struct.pack("<QQQII", 0, 1, size, 0, len(compression)) + compression + struct.pack("<Q", len(body)) + body
+    return b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(record)) + record
+
+
+def chunk_of_ros1(compression: bytes, size: int, body: bytes) -> bytes:
+    fields = [b"op=\x05", b"compression=" + compression, b"size=" + struct.pack("<I", size)]
+    header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    return b"#ROSBAG V2.0\n" + struct.pack("<I", len(header)) + header + struct.pack("<I", len(body)) + body
+
+
+ZEROS = bytes(2**24)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (chunk_of_mcap(b"lz4", 2**60, b""), "at most 268435456 are read"),
+        (chunk_of_mcap(b"lz4", 100, lz4.frame.compress(ZEROS)), "does not have the 100 bytes that it states"),
+        (chunk_of_mcap(b"zstd", 100, zstd.compress(ZEROS)), "does not have the 100 bytes that it states"),
+        (chunk_of_mcap(b"zstd", 2**24, zstd.compress(ZEROS)[:-4]), "does not have|cannot be decompressed"),
+        (chunk_of_mcap(b"lz4", 2**24, b"junk" * 99), "cannot be decompressed"),
+        (chunk_of_ros1(b"bz2", 100, bz2.compress(ZEROS)), "does not have the 100 bytes that it states"),
+        (chunk_of_ros1(b"bz2", 2**32 - 1, bz2.compress(ZEROS)), "at most 268435456 are read"),
+        (chunk_of_ros1(b"lz4", 100, lz4.frame.compress(ZEROS)), "does not have the 100 bytes that it states"),
+        (b"#ROSBAG V2.0\n" + struct.pack("<I", 2**32 - 1) + b"short", "truncated or damaged"),
+        (b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, 2**63), "at most 268435456 are read"),
+    ],
+)
+def test_chunks_that_would_fill_the_memory_are_refused(data: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / ("bomb.bag" if data.startswith(b"#") else "bomb.mcap")
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=f"^{path}: is .*({message})"):
+        RosBag(path)

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pycocotools.mask
 import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
@@ -189,3 +191,99 @@ def test_a_path_out_of_the_frame_is_a_fault(small_dataset: Path, full_pairs: lis
     assert "must name files of the frame's own folder" in fault
     with pytest.raises(ValueError, match="own folder"):
         Dataset(small_dataset).record(full_pairs[0].frame.frame_index)
+
+
+def edit_coco(dataset: Path, edit: Callable[..., Any]) -> None:
+    path = dataset / "annotations" / "all.json"
+    table = json.loads(path.read_text())
+    edit(table)
+    path.write_text(json.dumps(table))
+
+
+HUGE = 2**31 - 1
+
+
+@pytest.mark.parametrize(
+    "segmentation",
+    [
+        {"size": [HUGE, HUGE], "counts": "0" * 100},
+        {"size": [-1, -1], "counts": "0"},
+        {"size": [HUGE, 1], "counts": [HUGE]},
+        {"size": None, "counts": "0" * 1000},
+        {"counts": [0, 1]},
+        {"size": "as it was", "counts": [HUGE, HUGE, HUGE]},
+        {"size": "as it was", "counts": [-5, 5]},
+        {"size": "as it was", "counts": "~" * 1000},
+        {"size": "as it was", "counts": None},
+        [[0, 0, 1e9, 0, 1e9, 1e9]],
+        [[]],
+        None,
+        "\ud800",
+    ],
+)
+def test_hostile_segmentations_are_faults_beside_others(
+    small_dataset: Path, pairs: list[Pair], segmentation: Any
+) -> None:
+    def edit(table: dict[str, Any]) -> None:
+        before = table["annotations"][0]["segmentation"]
+        if isinstance(segmentation, dict) and segmentation.get("size") == "as it was":
+            segmentation["size"] = before["size"]
+        table["annotations"][0]["segmentation"] = segmentation
+
+    edit_coco(small_dataset, edit)
+    report = validate_dataset(small_dataset)
+    assert any("all.json: image" in fault and "segmentation" in fault for fault in report.faults)
+    assert report.pairs == len(pairs)
+
+
+def test_uncompressed_run_lengths_are_read(small_dataset: Path) -> None:
+    def edit(table: dict[str, Any]) -> None:
+        for annotation in table["annotations"]:
+            mask = pycocotools.mask.decode(annotation["segmentation"]).ravel(order="F")
+            ends = np.flatnonzero(np.diff(mask)) + 1
+            runs = np.diff([0, *ends, mask.size]).tolist()
+            annotation["segmentation"]["counts"] = runs if mask[0] == 0 else [0, *runs]
+
+    edit_coco(small_dataset, edit)
+    assert not any("segmentation" in fault for fault in faults_of(small_dataset))
+
+
+@pytest.mark.parametrize("categories", [None, [], [{"id": 2, "name": "drogue"}], [{"id": 1}], [7]])
+def test_annotations_without_the_drogues_category_are_a_fault(small_dataset: Path, categories: Any) -> None:
+    edit_coco(small_dataset, lambda table: table.pop("categories") and table.update(categories=categories))
+    if categories is None:
+        edit_coco(small_dataset, lambda table: table.pop("categories"))
+    assert any("all.json" in fault and ("categories" in fault or "COCO" in fault) for fault in faults_of(small_dataset))
+
+
+def test_more_markers_than_a_drogue_can_have_are_a_fault(small_dataset: Path, pairs: list[Pair]) -> None:
+    def edit(record: dict[str, Any]) -> None:
+        for eye in ("left", "right"):
+            record["views"][eye]["markers"] = record["views"][eye]["markers"][:1] * 300
+
+    edit_record(small_dataset, pairs[0], edit)
+    assert any("record.json: views.left.markers" in fault for fault in faults_of(small_dataset))
+
+
+@pytest.mark.parametrize("time_s", [1e300, -1e300, 2.0**31])
+def test_times_that_no_export_can_write_are_a_fault(small_dataset: Path, pairs: list[Pair], time_s: float) -> None:
+    edit_record(small_dataset, pairs[0], lambda record: record.update(time_s=time_s))
+    assert any("record.json: time_s" in fault for fault in faults_of(small_dataset))
+
+
+@pytest.mark.parametrize("text", ["NaN", "-Infinity", "1e999"])
+def test_numbers_that_are_none_are_a_fault(small_dataset: Path, pairs: list[Pair], text: str) -> None:
+    path = folder_of(small_dataset, pairs[0]) / "record.json"
+    table = json.loads(path.read_text())
+    table["views"]["left"]["markers"][0]["center_proj_px"][0] = "HERE"
+    path.write_text(json.dumps(table).replace('"HERE"', text))
+    assert any("record.json" in fault for fault in faults_of(small_dataset))
+
+
+def test_many_faults_of_a_kind_are_counted(small_dataset: Path) -> None:
+    for number in range(500):
+        (small_dataset / f".left-{number}.part").touch()
+    report = validate_dataset(small_dataset)
+    lines = report.fault_lines()
+    assert len(report.faults) == 500
+    assert len(lines) == 101 and lines[-1] == "leftovers: 400 more faults"

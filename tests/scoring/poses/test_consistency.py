@@ -9,7 +9,14 @@ import pytest
 from datasets_manifest.types.estimates import PoseEstimate
 from droguekit.scoring.confidence_intervals import mean_square_region, rms_upper_limit
 from droguekit.scoring.poses.cramer_rao import component_covariance
-from droguekit.scoring.poses.pose_errors import PoseError, nees, normalized_errors, pose_error, squared_errors
+from droguekit.scoring.poses.pose_errors import (
+    PoseError,
+    estimates_by_method,
+    nees,
+    normalized_errors,
+    pose_error,
+    squared_errors,
+)
 from geometry.se3 import RigidTransform, exp_twist
 
 
@@ -121,3 +128,19 @@ def test_upper_limit_of_known_cases(rng: np.random.Generator) -> None:
 def test_region_of_true_means_is_the_chi_square_law() -> None:
     # Quantiles 0.025 and 0.975 of 30 degrees of freedom: 16.791 and 46.979.
     assert mean_square_region(30) == pytest.approx((16.791 / 30, 46.979 / 30), rel=1e-4)
+
+
+def test_an_asymmetric_covariance_is_unusable(build: SimpleNamespace, covariance: np.ndarray) -> None:
+    pose, error = build.pose(0, 0, 5), PoseError(np.full(5, 1e-3), 0.0)
+    # As printed with few digits, or in floats of 32 bits.
+    assert squared_errors(estimate_of(pose, covariance.astype(np.float32).astype(np.float64)), error) is not None
+    lower = np.tril(covariance)
+    lower[3, 0] += 0.5 * np.sqrt(covariance[3, 3] * covariance[0, 0])
+    assert squared_errors(estimate_of(pose, lower), error) is None
+
+
+def test_files_of_too_many_methods_are_refused(build: SimpleNamespace) -> None:
+    estimates = [estimate_of(build.pose(0, 0, 5), None).model_copy(update={"method": f"m{k}"}) for k in range(101)]
+    assert len(estimates_by_method(estimates[:100], [0], "mine.jsonl")) == 100
+    with pytest.raises(ValueError, match=r"^mine\.jsonl: holds more than 100 methods; split it"):
+        estimates_by_method(estimates, [0], "mine.jsonl")
