@@ -206,4 +206,4 @@ def read_all(dataset: Path) -> None:
         for eye in EYES:
             source.part_ids(index, eye)
             camera = record.frame.rig.camera
-            read_passes((frame_folder(dataset, index) / f"{eye}.exr").read_bytes(), "passes", camera)
+            read_passes(source.frames.read(index, f"{eye}.exr"), "passes", camera)
