@@ -133,7 +133,7 @@ def compile_kernel(home: Path) -> subprocess.CompletedProcess[str]:
 
 
 def kernels(home: Path) -> list[Path]:
-    return sorted((home / ".drjit").iterdir())
+    return sorted((home / ".drjit").glob("*.bin"))
 
 
 def test_kernels_that_cannot_be_loaded_are_swept(tmp_path: Path) -> None:
