@@ -88,7 +88,8 @@ def _drogue_tile(pair: StereoPair) -> Picture:
     )
     if scale < 1:
         picture = cv2.GaussianBlur(picture, (0, 0), 0.4 / scale)
-    tile = cv2.warpAffine(picture, place, (_TILE_PX, _TILE_PX), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    paper = (_PAPER,) * 3
+    tile = cv2.warpAffine(picture, place, (_TILE_PX, _TILE_PX), flags=cv2.INTER_LINEAR, borderValue=paper)
     return _captioned(np.asarray(tile, dtype=np.uint8), pair)
 
 
