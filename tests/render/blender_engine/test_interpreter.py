@@ -105,14 +105,14 @@ def test_what_is_neither_python_nor_blender_is_refused(tmp_path: Path, lines: li
 
 
 def test_a_python_without_blender_says_so_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("render.blender_engine.process._MEMORY_FOLDER", tmp_path / "none")
+    monkeypatch.setattr("render.blender_engine.process.MEMORY_FOLDER", tmp_path / "none")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     # Without -S the same Python has what this one has.
     other = program(tmp_path / "python", f'exec "{Path(sys.executable).resolve()}" -S "$@"')
     with pytest.raises(ValueError, match=r"cannot be loaded by .*/python \(a test\): .*No module named '(bpy|numpy)'"):
         BlenderProcess(BlenderInterpreter(other, "a test"))
-    assert not list(tmp_path.glob("droguekit-blender-*"))
+    assert not list(tmp_path.glob("droguekit-*"))
 
 
 def fake_bpy(folder: Path, version: tuple[int, int, int]) -> Path:
