@@ -33,6 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure.add_argument("recipes", nargs="+", metavar="RECIPE", help="name of a recipe, or a .toml file")
     measure.add_argument("--scenes", type=int, default=200, metavar="N", help="scenes of each recipe (default 200)")
     sheets = commands.add_parser("sheets", help="every drogue and every tanker at four distances in four lights")
+    sheets.add_argument(
+        "names", nargs="*", metavar="NAME", help="only these, as `sheets` prints them: fighter-buddy-store (all)"
+    )
     detect = commands.add_parser("detect", help="a detector's scores by the kind of drogue")
     detect.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset with its truth")
     detect.add_argument("--detector", default="mobile-s", metavar="NAME", help="a shipped one, or a file (mobile-s)")
@@ -45,7 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif options.command == "detect":
         _detect(options.dataset, options.detector)
     else:
-        _draw_sheets(options.out, options.workers)
+        try:
+            _draw_sheets(options.out, options.workers, options.names)
+        except ValueError as error:
+            parser.error(str(error))
 
 
 def _measure(recipes: Sequence[str], scenes: int, out: Path, workers: int | None) -> None:
@@ -73,14 +79,18 @@ def _detect(dataset: Path, detector: str) -> None:
         print(f"{row.kind} | {row.images} | {row.drogues} | {' | '.join(shares)} | {row.false_boxes}")
 
 
-def _draw_sheets(out: Path, workers: int | None) -> None:
+def _draw_sheets(out: Path, workers: int | None, names: Sequence[str]) -> None:
     drogues = {name: {"drogue": name} for name in preset_names()}
     tankers = {
         f"{kind}-{station}": {"tanker": {"variants": [{"type": kind, "station": station}]}}
         for kind, stations in STATIONS.items()
         for station in stations
     }
-    for subject, changes in (("drogues", drogues), ("tankers", tankers)):
+    for name in names:
+        if name not in drogues | tankers:
+            raise ValueError(f"{name!r} is no subject; there are {', '.join(drogues | tankers)}")
+    for subject, everything in (("drogues", drogues), ("tankers", tankers)):
+        changes = {name: everything[name] for name in everything if name in names or not names}
         rows = sheet_rows(out / subject, changes, workers, whole_image=subject == "tankers")
         # A sheet of more rows would be too large to look at.
         for number, first in enumerate(range(0, len(rows), _ROWS_PER_SHEET), 1):
