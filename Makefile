@@ -14,7 +14,7 @@ setup: ## make .venv with everything in it (all extras)
 
 demo: ## render a small dataset, navigate on it blind, and report how accurate the poses are (installs core and Mitsuba)
 	@scripts/setup mitsuba
-	@echo "demo: rendering, navigating and scoring into out/demo"
+	@echo "demo: rendering, navigating and scoring into out/demo; the first report comes after 12 pairs"
 	@$(BIN)/droguekit demo --out out/demo
 	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
 

@@ -51,7 +51,8 @@ class FeaturePixels:
         return places[:, 1], places[:, 0]
 
 
-@lru_cache(maxsize=8)
+# A recipe may have a drogue for each of hundreds of scenes, and visits them in turn; a hull takes some kilobytes.
+@lru_cache(maxsize=1024)
 def drogue_hull_m(drogue: DrogueParameters) -> Array:
     """(V, 3) corners of the convex hull of rim, face, canopy, ribs, coupling, hub and markers, drogue frame. [m]
 

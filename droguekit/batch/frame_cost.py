@@ -32,8 +32,12 @@ from geometry.se3 import Array
 from render.device import Device
 from scenes.sampler import scene_of_frame
 
-# Fewer than three cannot separate distance from scene; more than a dozen hardly improve the mean.
-_FEWEST_PROBES, _MOST_PROBES = 3, 12
+PROBES = 5
+"""Measured frames with a drogue, unless another number is asked for."""
+# Fewer cannot separate distance from scene.
+_FEWEST_PROBES = 3
+# The first frames compile kernels; after the nearest and the farthest there are few left to compile.
+_MOST_WARM_UP = 2
 # Constant, inverse and inverse square of the distance.
 _TERMS = 3
 # The stage that makes a scene's environment; every process does it once for each of its scenes.
@@ -45,8 +49,7 @@ class ProbeFrames:
     """The frames that a probe makes.
 
     Attributes:
-        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk, so the first
-            dozen frames cost half as much again as later ones.
+        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk.
         counted: the frames from which the cost is estimated.
     """
 
@@ -73,8 +76,8 @@ class ProbeResult:
     drops: tuple[Drop, ...]
 
 
-def choose_probe_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
-    """One frame from each of several strata of distance, one without a drogue if there are any, and as many to warm up.
+def choose_probe_frames(drawn: DrawnFrames, count: int, most: int = PROBES) -> ProbeFrames:
+    """One frame from each of several strata of distance, one without a drogue if there are any, and two to warm up.
 
     The nearest and the farthest frame are among the counted ones. Within a stratum, families and then scenes that were
     chosen least often come first.
@@ -82,17 +85,18 @@ def choose_probe_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
     Args:
         drawn: of the recipe.
         count: number of all pairs of the recipe.
+        most: counted frames with a drogue, at most.
     """
     shows = np.flatnonzero(np.isfinite(drawn.distances_m))
     order = shows[np.argsort(drawn.distances_m[shows], kind="stable")]
     strata: list[NDArray[np.intp]] = np.array_split(
-        order, min(_MOST_PROBES, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order)))
+        order, min(most, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order)))
     )
     ends: list[NDArray[np.intp]] = [order[[-1]], *strata[1:-1], order[[0]]] if len(strata) > 1 else [order]
     empty = np.flatnonzero(np.isnan(drawn.distances_m))[:1]
     counted = _pick_rarest(drawn, [*ends, empty])
-    rest = [stratum[~np.isin(stratum, counted)] for stratum in strata]
-    warm_up = _pick_rarest(drawn, rest) or counted[:1]
+    near_and_far = [strata[0], strata[-1]][:_MOST_WARM_UP]
+    warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in near_and_far]) or counted[:1]
     return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)))
 
 
@@ -217,14 +221,20 @@ class CostEstimate:
         return max(1, min(workers, self.count), math.ceil(self.count / WorkerLimits().tasks_per_process))
 
 
-def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu") -> CostEstimate:
+def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes: int = PROBES) -> CostEstimate:
     """Render a few frames, spread over distances and families, and estimate the cost of all from them.
+
+    Args:
+        recipe: whose cost is estimated.
+        plan: of the recipe.
+        device: that the frames are rendered on.
+        probes: measured frames with a drogue, at most.
 
     Raises:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    frames = choose_probe_frames(plan.drawn, recipe.frames.count)
+    frames = choose_probe_frames(plan.drawn, recipe.frames.count, probes)
     return estimate_cost(recipe, plan, probe(recipe, frames, device))
 
 

@@ -8,6 +8,7 @@ being equally likely.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +30,12 @@ from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_dr
 _START_S = 300.0
 # Our choice, far above what any engine takes for one sample of one pixel.
 _S_PER_SAMPLE = 20e-6
-# Gives shares to within 1 % and every frame of the shipped corpora, in ten seconds.
-_MOST_SAMPLED = 10_000
+# Shares to within 3 %, in two seconds.
+_MOST_SAMPLED = 1000
+# A mesh takes a tenth of a second, and recipes may have a drogue for each of hundreds of scenes.
+_MOST_DROGUES = 24
+# Frames among which those of the chosen scenes are looked for.
+_MOST_LOOKED_AT = 10_000
 # Distance, middle and side of the box, room of its middle.
 _COLUMNS = 8
 SIZE_BINS = 10
@@ -95,7 +100,12 @@ class RecipePlan:
 
 
 def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan:
-    """Count the pairs of a recipe and draw its frames; of a large recipe, `most_sampled` frames, spread evenly.
+    """Count the pairs of a recipe, and draw some of its frames.
+
+    Args:
+        recipe: to plan.
+        most_sampled: frames to draw at most, spread evenly over the recipe, or over 24 of its scenes where more
+            scenes have drogues of their own.
 
     Raises:
         ValueError: none of the first ones can be made.
@@ -105,17 +115,34 @@ def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan
     for scene_id, pairs in by_scene.items():
         by_split[splits[scene_id]] += pairs
     by_family = {family.name: (0, 0) for family in recipe.families}
+    scenes_by_family: dict[str, list[int]] = {}
     for scene_id, pairs in by_scene.items():
         family = family_of_scene(recipe, scene_id)
+        name = "" if family is None else family.name
+        scenes_by_family.setdefault(name, []).append(scene_id)
         if family is not None:
-            scenes, total = by_family[family.name]
-            by_family[family.name] = scenes + 1, total + pairs
-    sampled = tuple(
-        sorted(
-            {int(index) for index in np.linspace(0, recipe.frames.count - 1, min(recipe.frames.count, most_sampled))}
-        )
-    )
-    return RecipePlan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, sampled))
+            scenes, total = by_family[name]
+            by_family[name] = scenes + 1, total + pairs
+    indices = _frames_to_draw(recipe, [scene for scenes in scenes_by_family.values() for scene in scenes], most_sampled)
+    return RecipePlan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, indices))
+
+
+def _frames_to_draw(recipe: Recipe, scenes_by_family: Sequence[int], most_sampled: int) -> tuple[int, ...]:
+    """Indices of frames, ascending, of scenes with at most `_MOST_DROGUES` drogues; scenes one family after another."""
+    count = recipe.frames.count
+    drogues = {drogue_of_scene(recipe_of_scene(recipe, scene_id), scene_id) for scene_id in scenes_by_family}
+    if len(drogues) <= _MOST_DROGUES:
+        return _evenly(range(count), most_sampled)
+    # Evenly over scenes that stand family by family, so that families keep their shares.
+    chosen = set(_evenly(scenes_by_family, _MOST_DROGUES))
+    looked_at = _evenly(range(count), _MOST_LOOKED_AT)
+    return _evenly([index for index in looked_at if scene_of_frame(recipe, index) in chosen], most_sampled)
+
+
+def _evenly(values: Sequence[int], most: int) -> tuple[int, ...]:
+    """At most so many of the values, the first and the last among them."""
+    places = np.linspace(0, len(values) - 1, min(len(values), most))
+    return tuple(values[place] for place in sorted({int(place) for place in places}))
 
 
 def frame_timeout_s(recipe: Recipe) -> float:

@@ -29,7 +29,7 @@ def plan_lines(
     name_or_path: str,
     seed: int | None,
     engine: str | None,
-    probe: bool,
+    probes: int | None,
     execution: ExecutionOptions,
     html: Path | None,
 ) -> Iterator[str]:
@@ -39,7 +39,7 @@ def plan_lines(
         name_or_path: of the recipe.
         seed: replaces the recipe's, or None.
         engine: replaces the recipe's, or None.
-        probe: whether a few frames are rendered to estimate time and size.
+        probes: frames with a drogue that are rendered to estimate time and size; 0 renders none, None as many as usual.
         execution: workers for which the time is estimated, and the device that the frames are rendered on.
         html: page to write with the plan's plots, or None.
 
@@ -47,18 +47,19 @@ def plan_lines(
         ValueError: no such recipe or engine, a wrong number, or none of the first frames can be made.
         OSError: the page or the temporary folder cannot be written.
     """
-    from droguekit.batch.frame_cost import probe_cost
+    from droguekit.batch.frame_cost import PROBES, probe_cost
     from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
-    if execution.workers is not None and (not probe or execution.workers < 1):
+    if execution.workers is not None and (probes == 0 or execution.workers < 1):
         raise ValueError("--workers: must be at least 1, and goes with the probe; leave it or --no-probe out")
     recipe = open_recipe(name_or_path, seed, engine).recipe
     plan = plan_recipe(recipe)
     lines = [*_counts(recipe, plan), *_distances(recipe, plan), *_laws(recipe, plan)]
     lines.append(f"a frame that is at work for {duration(frame_timeout_s(recipe))} counts as hung and is tried again")
     yield from lines
-    if probe:
-        costs = list(cost_lines(probe_cost(recipe, plan, execution.device), execution.worker_count()))
+    probes = PROBES if probes is None else probes
+    if probes:
+        costs = list(cost_lines(probe_cost(recipe, plan, execution.device, probes), execution.worker_count()))
         yield from costs
         lines += costs
     if html is not None:

@@ -60,7 +60,7 @@ def test_shares_are_those_of_the_sampler(law: str) -> None:
 @pytest.mark.parametrize("law", ["uniform", "log-uniform"])
 def test_sizes_and_places_of_a_recipe_follow_its_own_law(law: str) -> None:
     recipe = lawful(law)
-    drawn = plan_recipe(recipe).drawn
+    drawn = plan_recipe(recipe, most_sampled=1500).drawn
     sizes, places = check_sizes(drawn, recipe), check_places(drawn, recipe.rig.camera)
     assert sizes is not None and places is not None
     assert sizes[0].counts.sum() == places.counts.sum() == 1500

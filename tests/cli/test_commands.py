@@ -23,6 +23,7 @@ from droguekit.cli.main import DONE, WRONG_INPUT, run
 from nav.runner import method_names
 from render.mitsuba_engine.variant import probe_variant
 from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
+from tests.support.small_datasets import SINGLE_PAIRS
 
 # The scalar variant takes its time with every pixel.
 SMALL_RECIPE = recipe_text(
@@ -144,6 +145,23 @@ def test_demo_goes_from_a_recipe_to_a_report_and_keeps_what_is_there(
     assert result["dataset"]["sha256"] == read_manifest(smoke_dataset).dataset_sha256
     assert set(result["methods"]) == set(method_names())
     assert "<svg" in (out / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_demo_reports_a_few_pairs_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("droguekit.cli.demo._FIRST_PAIRS", 2)
+    (tmp_path / "small.toml").write_text(recipe_text(SINGLE_PAIRS, frames={"count": 3}))
+    out = tmp_path / "out"
+    command = ["demo", str(tmp_path / "small.toml"), "--out", str(out), "--workers", "0"]
+    assert run(command) == DONE
+    told = capsys.readouterr().err
+    assert f"{out}/report.html has a first report, of 2 pairs; going on to 3" in told
+    assert told.index("rendering 2 stereo pairs") < told.index("first report") < told.index("rendering 3 stereo pairs")
+    assert json.loads((out / "benchmark.json").read_text())["dataset"]["pairs"] == 3
+    assert run(command) == DONE
+    assert "first report" not in capsys.readouterr().err
 
 
 @pytest.mark.mitsuba
