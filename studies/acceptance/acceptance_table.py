@@ -1,11 +1,176 @@
-"""Criteria and measured values as a table, for people (bars.md, terminal) and programs (bars.json)."""
+"""Criteria and measured values with one-sided 95 % limits, for people (bars.md, terminal) and programs (bars.json).
+
+Pairs of a sequence are not independent of their neighbours; sequences are independent of each other. The `block` limits
+are those of the sequences' own means, by Student's law, or of resampled sequences. They are never less than those of
+independent pairs: a few sequences that happen to agree would promise too much. Pairs of a single sequence count as
+independent, as nothing shows how much sequences differ.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict
+from scipy.stats import beta, binom, norm, t
+
+from datasets_manifest.random_streams import named_generator
+from droguekit.scoring.confidence_intervals import CONFIDENCE, RESAMPLES, rms_upper_limit
+from geometry.se3 import Array
+
+ValueWithLimit = tuple[float, float]
+"""A value and its upper limit."""
+
+
+def rms_limit(values: ArrayLike) -> ValueWithLimit:
+    """Root mean square of normal errors about zero."""
+    errors = np.asarray(values, dtype=np.float64)
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    return rms, rms_upper_limit(rms, errors.size)
+
+
+def mean_limit(values: ArrayLike) -> ValueWithLimit:
+    """Mean, by Student's law; with a single number the limit is the value itself."""
+    numbers = np.asarray(values, dtype=np.float64)
+    mean, count = float(numbers.mean()), numbers.size
+    if count < 2:
+        return mean, mean
+    return mean, mean + float(t.ppf(CONFIDENCE, count - 1) * numbers.std(ddof=1) / np.sqrt(count))
+
+
+def absolute_mean_limit(blocks: Array) -> ValueWithLimit:
+    """Absolute value of a mean, from one mean for each independent block."""
+    mean = float(blocks.mean())
+    _, high = mean_limit(blocks)
+    return abs(mean), abs(mean) + (high - mean)
+
+
+def share_limit(hits: int, count: int) -> ValueWithLimit:
+    """A share, by the binomial law (C. Clopper, E. Pearson, Biometrika 26 (1934) 404, doi:10.1093/biomet/26.4.404)."""
+    return hits / count, 1.0 if hits == count else float(beta.ppf(CONFIDENCE, hits + 1, count - hits))
+
+
+def percentile_limit(values: ArrayLike, percent: float) -> ValueWithLimit:
+    """Percentile of absolute values, and the smallest order statistic that covers the true one with 95 %.
+
+    With too few values the largest one is used.
+    """
+    ordered = np.sort(np.abs(np.asarray(values, dtype=np.float64)))
+    rank = int(binom.ppf(CONFIDENCE, ordered.size, percent / 100))
+    return float(np.percentile(ordered, percent)), float(ordered[min(rank, ordered.size - 1)])
+
+
+def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> ValueWithLimit:
+    """Ratio of two positive means over the same frames, by Student's law of its logarithm to first order.
+
+    Args:
+        above, below: sums over the same independent blocks of frames, two or more.
+    """
+    first, second = (np.asarray(values, dtype=np.float64) for values in (above, below))
+    ratio, blocks = float(first.sum() / second.sum()), len(first)
+    shares = blocks * (first / first.sum() - second / second.sum())
+    error = shares.std(ddof=1) / np.sqrt(blocks)
+    return ratio, ratio * float(np.exp(t.ppf(CONFIDENCE, blocks - 1) * error))
+
+
+def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> ValueWithLimit:
+    """Ratio of two root mean squares of normal errors, each given with the number of values."""
+    ratio = above[0] / below[0]
+    variance = sum(1 / (2 * count) for _, count in (above, below))
+    return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(variance)))
+
+
+def paired_rms_ratio_limit(above: float, below: float, correlation: float, count: int) -> ValueWithLimit:
+    """Ratio of root mean squares of two normal errors in the same frames.
+
+    The logarithms of two such root mean squares have a difference of variance `(1 - correlation^2) / count`.
+
+    Args:
+        above, below: the root mean squares.
+        correlation: of the errors, about zero.
+        count: of frames.
+    """
+    ratio = above / below
+    return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(max(0.0, 1 - correlation**2) / count)))
+
+
+def nees_limits(per_freedom: float, freedom: int) -> tuple[float, float, float]:
+    """Mean normalised square error over its degrees of freedom, with lower and upper limit by the normal law.
+
+    Args:
+        per_freedom: the mean.
+        freedom: of all poses together.
+    """
+    reach = float(norm.ppf(CONFIDENCE)) * per_freedom * np.sqrt(2 / freedom)
+    return per_freedom, per_freedom - float(reach), per_freedom + float(reach)
+
+
+def block_mean_limit(values: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
+    """Mean, with the larger of the limits by the scatter of the blocks about it and by that of the values.
+
+    Args:
+        values: (n,) one or more.
+        blocks: (n,) which sequence each belongs to.
+
+    Source: ratio estimator of cluster samples, W. Cochran, Sampling Techniques, 3rd ed., eq. 9A.1, with Student's law
+    of as many degrees of freedom as there are blocks, less one.
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    mean, limit = mean_limit(numbers)
+    sums, counts = _by_block(numbers, blocks)
+    if len(counts) < 2:
+        return mean, limit
+    shares = len(counts) * (sums - mean * counts) / counts.sum()
+    error = float(shares.std(ddof=1) / np.sqrt(len(counts)))
+    return mean, max(limit, mean + float(t.ppf(CONFIDENCE, len(counts) - 1)) * error)
+
+
+def block_share_limit(hits: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
+    """A share, with the larger of the limits by blocks and by the binomial law; of a single block by the latter."""
+    numbers = np.asarray(hits, dtype=np.float64)
+    share, limit = share_limit(int(numbers.sum()), numbers.size)
+    if len(set(blocks)) < 2:
+        return share, limit
+    return share, min(1.0, max(limit, block_mean_limit(numbers, blocks)[1]))
+
+
+def block_rms_limit(errors: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
+    """Root mean square, from the limit of the mean square."""
+    mean, limit = block_mean_limit(np.square(np.asarray(errors, dtype=np.float64)), blocks)
+    return float(np.sqrt(mean)), float(np.sqrt(limit))
+
+
+def block_percentile_limit(values: ArrayLike, blocks: Sequence[int], percent: float, key: str) -> ValueWithLimit:
+    """Percentile of absolute values, with the larger of the limits by resampled blocks and by order statistics.
+
+    Args:
+        values: (n,).
+        blocks: (n,) which sequence each belongs to.
+        percent: which.
+        key: of the random stream.
+    """
+    sizes = np.abs(np.asarray(values, dtype=np.float64))
+    value, limit = percentile_limit(sizes, percent)
+    names = sorted(set(blocks))
+    if len(names) < 2:
+        return value, limit
+    of_block = np.asarray(blocks)
+    parts = [sizes[of_block == name] for name in names]
+    rng = named_generator(key)
+    drawn = [
+        np.percentile(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))]), percent)
+        for _ in range(RESAMPLES)
+    ]
+    return value, max(limit, float(np.percentile(drawn, 100 * CONFIDENCE)))
+
+
+def _by_block(values: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
+    """Sum and number of the values of each block."""
+    _, place = np.unique(np.asarray(blocks), return_inverse=True)
+    return np.bincount(place, values).astype(np.float64), np.bincount(place).astype(np.float64)
+
 
 GOAL, COMPARISON = "goal", "beside"
 

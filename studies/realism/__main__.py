@@ -3,9 +3,142 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from studies.realism.sky_measures import sky_table
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.environment import Environment, SkyModel
+from scenes.environment_radiance import EnvironmentRadiance
+from scenes.sky.photometry import direction_from_angles, luminance
+
+SKY_MODELS: tuple[SkyModel, ...] = ("daylight", "scattering")
+# The visibilities at which both have a common clear day: around the camera, and at the ground.
+_VISIBILITY_M: dict[SkyModel, float] = {"daylight": 120_000.0, "scattering": 50_000.0}
+_DISC_STEP_DEG = 0.05
+
+
+@dataclass(frozen=True)
+class SkyMeasure:
+    """One number of a sky.
+
+    Attributes:
+        name: what it is.
+        expected: what is measured, or follows from geometry, with its source.
+        measure: takes the model.
+    """
+
+    name: str
+    expected: str
+    measure: Callable[[SkyModel], float]
+
+
+def _around(model: SkyModel, sun_deg: float, altitude_m: float, turbidity: float = 3.0) -> EnvironmentRadiance:
+    environment = Environment(
+        sun_elevation_deg=sun_deg,
+        sun_azimuth_deg=0.0,
+        turbidity=turbidity,
+        visibility_m=_VISIBILITY_M[model],
+        altitude_m=altitude_m,
+        ground_reflectance_rgb=(0.1, 0.1, 0.06),
+        ground_texture_seed=1,
+        sky_model=model,
+    )
+    return EnvironmentRadiance(environment)
+
+
+def _sky(around: EnvironmentRadiance, elevation_deg: float, azimuths_deg: Sequence[float]) -> NDArray[np.float64]:
+    rays = np.stack([direction_from_angles(elevation_deg, azimuth) for azimuth in azimuths_deg])
+    mean: NDArray[np.float64] = around.sky.radiance(rays).mean(axis=0, dtype=np.float64)
+    return mean
+
+
+_AWAY = (60.0, 90.0, 120.0, 150.0, 180.0)
+
+
+def glow_blue_over_red(model: SkyModel) -> float:
+    """Blue over red 1 degree up, from 3 km, over a sun 4 degrees down."""
+    light = _sky(_around(model, -4.0, 3000.0, 2.5), 1.0, (0.0,))
+    return float(light[2] / light[0])
+
+
+def glow_8_over_horizon(model: SkyModel, altitude_m: float = 3000.0) -> float:
+    """Luminance 8 degrees up over that 1 degree up, over a sun 4 degrees down."""
+    around = _around(model, -4.0, altitude_m, 2.5)
+    return float(luminance(_sky(around, 8.0, (0.0,))) / luminance(_sky(around, 1.0, (0.0,))))
+
+
+def whitening(model: SkyModel) -> float:
+    """Luminance 20 degrees up over that at the horizon by day, away from the sun."""
+    around = _around(model, 40.0, 10.0)
+    return float(luminance(_sky(around, 20.0, _AWAY)) / luminance(_sky(around, 0.3, _AWAY)))
+
+
+def day_blue_over_red(model: SkyModel) -> float:
+    """Blue over red 3 degrees up by day, away from the sun."""
+    light = _sky(_around(model, 40.0, 10.0), 3.0, _AWAY)
+    return float(light[2] / light[0])
+
+
+def setting_deg(model: SkyModel) -> float:
+    """Elevation of the sun at which the last of its disc is drawn, from 3 km up."""
+    last = 0.0
+    for elevation_deg in np.arange(1.0, -3.0, -_DISC_STEP_DEG):
+        sky = _around(model, float(elevation_deg), 3000.0).sky
+        upright = np.radians(elevation_deg + np.linspace(-0.26, 0.26, 27))
+        rays = np.stack([np.cos(upright), np.zeros(27), np.sin(upright)], axis=-1)[None].astype(np.float32)
+        disc = np.zeros(rays.shape, dtype=np.float32)
+        sky.add_discs(disc, rays, 1.0)
+        if disc.any():
+            last = float(elevation_deg)
+    return last
+
+
+def illuminance_lux(model: SkyModel, sun_deg: float) -> float:
+    """Illuminance of level ground under the clear sky. [lux]"""
+    return float(luminance(_around(model, sun_deg, 10.0, 2.5).ground_illuminance_lux))
+
+
+SKY_MEASURES: tuple[SkyMeasure, ...] = (
+    SkyMeasure("B/R 1 deg over a sun at -4 deg, from 3 km", "below 0.5: the glow is red", glow_blue_over_red),
+    SkyMeasure("Y(8 deg) / Y(1 deg) over it, from 3 km", "below 1: brightest low", glow_8_over_horizon),
+    SkyMeasure(
+        "Y(8 deg) / Y(1 deg) over it, at the ground",
+        "haze hides the lowest glow",
+        lambda model: glow_8_over_horizon(model, 10.0),
+    ),
+    SkyMeasure("Y(20 deg) / Y(0) by day", "0.61 (CIE clear), 0.49 (an HDRI)", whitening),
+    SkyMeasure("B/R 3 deg up by day", "1.25 to 1.4", day_blue_over_red),
+    SkyMeasure("sun sets from 3 km at [deg]", "-1.76 - 0.27 (dip, radius)", setting_deg),
+    SkyMeasure("illuminance at -0.833 deg [lux]", "410 to 585", lambda model: illuminance_lux(model, -0.833)),
+    SkyMeasure("illuminance at -6 deg [lux]", "2.0 to 3.5", lambda model: illuminance_lux(model, -6.0)),
+    SkyMeasure("illuminance at -12 deg [lux]", "0.004 to 0.008", lambda model: illuminance_lux(model, -12.0)),
+)
+
+
+def first_background_s(model: SkyModel) -> float:
+    """Processor seconds until the first 80 x 60 rays of a new scene are known, its tables included. [s]"""
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 80), np.linspace(0.2, -0.2, 60))
+    rays = np.stack([np.ones_like(x), x, y], axis=-1)
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    started = time.process_time()
+    _around(model, 33.0, 2000.0, 2.2).radiance(rays)
+    return time.process_time() - started
+
+
+def sky_table() -> str:
+    """The measures of both models, as a table in Markdown."""
+    rows = ["| measure | expected | " + " | ".join(f"`{model}`" for model in SKY_MODELS) + " |", "|---|---|---|---|"]
+    for item in SKY_MEASURES:
+        cells = [f"{item.measure(model):.3g}" for model in SKY_MODELS]
+        rows.append(f"| {item.name} | {item.expected} | {' | '.join(cells)} |")
+    # Ground textures are made once a process.
+    first_background_s("daylight")
+    cells = [f"{first_background_s(model):.2g}" for model in SKY_MODELS]
+    rows.append(f"| CPU s of a scene's first 80 x 60 rays | 1 to 3 | {' | '.join(cells)} |")
+    return "\n".join(rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,14 +6,108 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 
 import torch
+from torch.utils.data import DataLoader
 
-from droguekit.torch import RenderStream
+from datasets_manifest.recipe.recipe import Recipe
+from droguekit.api.recipe_rendering import load_recipe
+from droguekit.torch import RenderStream, Sample
+from nav.detector.network.head import detection_loss
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from studies.training_feed.epoch_feed import feed_recipe, left_and_right, measure_epoch
+
+# The seed paper's network input.
+HEIGHT_PX, WIDTH_PX = 320, 416
+_RECIPE = "detector-small"
+
+
+@dataclass(frozen=True)
+class Feed:
+    """Times of one epoch.
+
+    Attributes:
+        steps: that were trained, without the first.
+        start_s: until the first batch came. [s]
+        waiting_s: for the other batches. [s]
+        training_s: in the other steps. [s]
+    """
+
+    steps: int
+    start_s: float
+    waiting_s: float
+    training_s: float
+
+    @property
+    def fed_fraction(self) -> float:
+        """Share of the time after the first batch in which the training did not wait."""
+        return self.training_s / (self.training_s + self.waiting_s)
+
+    def line(self, name: str) -> str:
+        """The times as a line."""
+        return (
+            f"{name}: {self.steps} steps, first batch after {self.start_s:.1f} s; then {self.training_s:.1f} s of "
+            f"training and {self.waiting_s:.1f} s of waiting: fed {100 * self.fed_fraction:.1f} % of the time"
+        )
+
+
+def feed_recipe(pairs: int) -> Recipe:
+    """The detector's small corpus at the network's size."""
+    # The same field of view as the corpus.
+    camera = load_recipe(_RECIPE).rig.camera
+    focal_px = camera.fx_px * WIDTH_PX / camera.width_px
+    rig = {
+        "preset": "rgb-ideal",
+        "width_px": WIDTH_PX,
+        "height_px": HEIGHT_PX,
+        "focal_px": focal_px,
+        "encoding": "gamma",
+    }
+    return load_recipe(_RECIPE, rig=rig, frames={"count": pairs, "scenes": min(pairs, 20)})
+
+
+def left_and_right(sample: Sample) -> tuple[torch.Tensor, torch.Tensor]:
+    """(2, 3, H, W) images between 0 and 1, and (2, 4) boxes, NaN without a drogue. [px]"""
+    return torch.stack([sample["left"], sample["right"]]).float() / 255, sample["boxes_px"]
+
+
+def measure_epoch(stream: RenderStream, batch_pairs: int, network: DetectorNetwork, workers: int = 1) -> Feed:
+    """Train one epoch, and time it."""
+    loader: DataLoader[tuple[torch.Tensor, torch.Tensor]] = DataLoader(
+        stream,
+        batch_size=batch_pairs,
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
+        prefetch_factor=8 if workers else None,
+    )
+    optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
+    waiting, training = [], []
+    for waited_s, images, boxes in _timed_batches(loader):
+        step_s = perf_counter()
+        flat = boxes.reshape(-1, 4)
+        truth = [row[None] if torch.isfinite(row).all() else row[:0].reshape(0, 4) for row in flat]
+        loss = detection_loss(network(images.flatten(0, 1)), truth)
+        optimizer.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        waiting.append(waited_s)
+        training.append(perf_counter() - step_s)
+    if len(training) < 2:
+        raise ValueError(f"--pairs: an epoch of {len(training)} steps is too short to measure; give more pairs")
+    return Feed(len(training) - 1, waiting[0], sum(waiting[1:]), sum(training[1:]))
+
+
+def _timed_batches(
+    loader: DataLoader[tuple[torch.Tensor, torch.Tensor]],
+) -> Iterator[tuple[float, torch.Tensor, torch.Tensor]]:
+    """Batches with the time that each was waited for. [s]"""
+    asked_s = perf_counter()
+    for images, boxes in loader:
+        yield perf_counter() - asked_s, images, boxes
+        asked_s = perf_counter()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
-from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage
+from studies.acceptance.rendered.scored_frames import PixelLight, outline_coverage
 
 DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
 DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)

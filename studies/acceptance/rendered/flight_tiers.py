@@ -16,16 +16,22 @@ from datasets_manifest.recipe.recipe import FrameCounts, Recipe
 from droguekit.scoring.poses.pose_errors import COMPONENTS
 from droguekit.scoring.results.benchmark_result import BenchmarkResult
 from droguekit.scoring.sequences.tracking_scores import REACQUISITION_LIMIT_FRAMES, reacquisition
-from studies.acceptance.acceptance_table import COMPARISON, GOAL, AcceptanceRow, at_most, between, not_measured, worst
-from studies.acceptance.confidence_limits import (
+from studies.acceptance.acceptance_table import (
+    COMPARISON,
+    GOAL,
+    AcceptanceRow,
     ValueWithLimit,
+    at_most,
+    between,
     block_mean_limit,
     block_percentile_limit,
     block_rms_limit,
     block_share_limit,
     mean_limit,
+    not_measured,
     paired_ratio_limit,
     share_limit,
+    worst,
 )
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, Scores

@@ -13,15 +13,19 @@ from droguekit.scoring.confidence_intervals import ratio_intervals, rms_upper_li
 from droguekit.scoring.poses.pose_errors import COMPONENTS
 from droguekit.scoring.results.benchmark_result import BenchmarkResult, PoseBin
 from geometry.se3 import Array
-from studies.acceptance.acceptance_table import AcceptanceRow, at_most, between, not_measured, worst
-from studies.acceptance.confidence_limits import (
+from studies.acceptance.acceptance_table import (
+    AcceptanceRow,
     absolute_mean_limit,
+    at_most,
+    between,
     mean_limit,
     nees_limits,
+    not_measured,
     percentile_limit,
     rms_limit,
     rms_ratio_limit,
     share_limit,
+    worst,
 )
 from studies.acceptance.rendered.scored_frames import (
     BEST,

@@ -20,7 +20,7 @@ from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.face_background import FaceBackground, background_shares
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.outline_pixels import disc_pixels
-from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px
+from studies.acceptance.rendered.scored_frames import PixelLight, center_bound_px
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 from tests.support.grey_centroid import grey_centroids
 from tests.support.painted_pairs import make_pose, paint_pair

@@ -17,7 +17,7 @@ from nav.centroids.face_background import FaceBackground
 from nav.centroids.marker_signal import marker_signals
 from nav.centroids.outline_pixels import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
-from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px
+from studies.acceptance.rendered.scored_frames import PixelLight, center_bound_px
 from tests.support.drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start
 
 

@@ -12,7 +12,7 @@ from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import motion_blurred
 from nav.centroids.outline_pixels import disc_pixels
-from studies.acceptance.rendered.centroid_bounds import PixelLight
+from studies.acceptance.rendered.scored_frames import PixelLight
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
 PARTS = 32

@@ -14,14 +14,14 @@ from datasets_manifest.types.estimates import read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import WRONG_INPUT
 from nav.runner import method_names
-from studies.acceptance.__main__ import run_command
-from studies.acceptance.acceptance_run import (
+from studies.acceptance.__main__ import (
     AcceptanceOptions,
     FlightOptions,
     measure_flight_tier,
     measure_tier,
     plan_flights,
     plan_images,
+    run_command,
 )
 from studies.acceptance.acceptance_table import AcceptanceRow
 from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, approach_rows, lost_rows, part_length
@@ -208,7 +208,7 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
 
 
 def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.acceptance.acceptance_run._TIMED_PAIRS", 1)
+    monkeypatch.setattr("studies.acceptance.__main__._TIMED_PAIRS", 1)
     told = io.StringIO()
     tables = [
         measure_tier(AcceptanceOptions("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)

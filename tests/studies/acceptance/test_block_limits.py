@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.acceptance.confidence_limits import (
+from studies.acceptance.acceptance_table import (
     block_mean_limit,
     block_percentile_limit,
     block_rms_limit,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px, disc_outline_px, outline_coverage
+from studies.acceptance.rendered.scored_frames import PixelLight, center_bound_px, disc_outline_px, outline_coverage
 
 DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
 DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)

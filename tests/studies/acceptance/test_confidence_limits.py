@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.acceptance import confidence_limits
+from studies.acceptance import acceptance_table
 from studies.acceptance.acceptance_table import AcceptanceTable, at_most, between, not_measured
 
 
@@ -16,7 +16,7 @@ def rng(stream: int) -> np.random.Generator:
 
 def test_the_limit_of_a_root_mean_square_is_the_chi_square_one() -> None:
     values = rng(1).normal(size=400)
-    rms, limit = confidence_limits.rms_limit(values)
+    rms, limit = acceptance_table.rms_limit(values)
     assert rms == pytest.approx(np.sqrt(np.mean(values**2)))
     # At the limit, so small a sum of squares has just the probability of 5 %.
     assert stats.chi2.cdf(400 * rms**2 / limit**2, 400) == pytest.approx(0.05)
@@ -24,13 +24,13 @@ def test_the_limit_of_a_root_mean_square_is_the_chi_square_one() -> None:
 
 def test_the_limit_of_a_mean_is_students() -> None:
     values = rng(2).normal(3.0, 2.0, size=30)
-    _, limit = confidence_limits.mean_limit(values)
+    _, limit = acceptance_table.mean_limit(values)
     assert limit == pytest.approx(stats.ttest_1samp(values, 0.0, alternative="less").confidence_interval(0.95).high)
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 400), (7, 400), (399, 400), (400, 400)])
 def test_the_limit_of_a_share_is_the_exact_one(hits: int, count: int) -> None:
-    share, limit = confidence_limits.share_limit(hits, count)
+    share, limit = acceptance_table.share_limit(hits, count)
     test = stats.binomtest(hits, count, alternative="less")
     assert share == hits / count
     assert limit == pytest.approx(test.proportion_ci(0.95, method="exact").high)
@@ -39,7 +39,7 @@ def test_the_limit_of_a_share_is_the_exact_one(hits: int, count: int) -> None:
 def test_the_limit_of_a_percentile_covers_it_in_19_of_20_samples() -> None:
     true = stats.halfnorm.ppf(0.99)
     samples = rng(3).normal(size=(2000, 600))
-    covered = np.mean([confidence_limits.percentile_limit(sample, 99.0)[1] >= true for sample in samples])
+    covered = np.mean([acceptance_table.percentile_limit(sample, 99.0)[1] >= true for sample in samples])
     # The order statistic is the first that reaches 95 %; four standard errors of 2000 trials are 2 %.
     assert covered >= 0.95 - 0.02
 
@@ -48,7 +48,7 @@ def test_the_limit_of_a_ratio_in_the_same_frames_covers_it_in_19_of_20_samples()
     draws = rng(4)
     place = draws.exponential(1.0, (4000, 40, 10))
     above, below = (size * (place * draws.exponential(1.0, place.shape)).sum(axis=2) for size in (2.0, 1.0))
-    limits = np.array([confidence_limits.paired_ratio_limit(a, b)[1] for a, b in zip(above, below, strict=True)])
+    limits = np.array([acceptance_table.paired_ratio_limit(a, b)[1] for a, b in zip(above, below, strict=True)])
     # First order in the number of blocks, and four standard errors of 4000 trials: 1.4 %.
     assert np.mean(limits >= 2.0) == pytest.approx(0.95, abs=0.025)
 
@@ -62,7 +62,7 @@ def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None
     for a, b in zip(above, below, strict=True):
         sizes = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
         correlation = np.mean(a * b) / (sizes[0] * sizes[1])
-        limits.append(confidence_limits.paired_rms_ratio_limit(*sizes, correlation, a.size)[1])
+        limits.append(acceptance_table.paired_rms_ratio_limit(*sizes, correlation, a.size)[1])
     # As above.
     assert np.mean(np.array(limits) >= np.sqrt(0.9)) == pytest.approx(0.95, abs=0.02)
     # Taken as independent the limit would be 7 % above the ratio.
@@ -72,7 +72,7 @@ def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None
 def test_the_limit_of_a_ratio_of_root_mean_squares_covers_it_in_19_of_20_samples() -> None:
     above, below = rng(5).normal(0, 3.0, (4000, 200)), rng(6).normal(0, 1.0, (4000, 300))
     limits = [
-        confidence_limits.rms_ratio_limit((np.sqrt(np.mean(a**2)), a.size), (np.sqrt(np.mean(b**2)), b.size))[1]
+        acceptance_table.rms_ratio_limit((np.sqrt(np.mean(a**2)), a.size), (np.sqrt(np.mean(b**2)), b.size))[1]
         for a, b in zip(above, below, strict=True)
     ]
     # As above.
@@ -81,7 +81,7 @@ def test_the_limit_of_a_ratio_of_root_mean_squares_covers_it_in_19_of_20_samples
 
 def test_the_limits_of_nees_hold_the_chi_square_quantiles() -> None:
     freedom = 2000
-    value, low, high = confidence_limits.nees_limits(1.0, freedom)
+    value, low, high = acceptance_table.nees_limits(1.0, freedom)
     quantiles = stats.chi2.ppf([0.05, 0.95], freedom) / freedom
     # The normal law departs from chi-square by the order of 1/freedom.
     assert (value, low, high) == pytest.approx((1.0, *quantiles), abs=2 / freedom)

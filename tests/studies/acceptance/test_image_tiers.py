@@ -12,9 +12,8 @@ from droguekit.batch.recipe_plan import plan_recipe
 from studies.acceptance.centroid_level.monte_carlo import STATIONS_M
 from studies.acceptance.finished_results import is_navigated, mark_navigated
 from studies.acceptance.rendered import image_tiers
-from studies.acceptance.rendered.centroid_bounds import contrast_from_snr
 from studies.acceptance.rendered.image_tiers import ImageScores, recipe_of
-from studies.acceptance.rendered.scored_frames import BEST, CHAIN, FrameErrors, MarkerErrors
+from studies.acceptance.rendered.scored_frames import BEST, CHAIN, FrameErrors, MarkerErrors, contrast_from_snr
 
 PER_STATION = 30
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from studies.drawn_cameras.picture_measures import blockiness, calm_noise, edge_width_px, measure_pictures
+from studies.drawn_cameras.__main__ import blockiness, calm_noise, edge_width_px, measure_pictures
 
 
 def test_white_noise_has_no_correlation_and_blurred_noise_that_of_its_blur() -> None:

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from render.engine import load_engine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from studies.engine_agreement.__main__ import main
-from studies.engine_agreement.comparison_run import ResultStore
+from studies.engine_agreement.__main__ import ResultStore, main
 from studies.engine_agreement.costs import CostComparison, EngineCost, cost_from_row, measure_costs
 from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family, write_sky_recipe
 

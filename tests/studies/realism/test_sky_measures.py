@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.realism.sky_measures import (
+from studies.realism.__main__ import (
     SKY_MEASURES,
     day_blue_over_red,
     glow_8_over_horizon,

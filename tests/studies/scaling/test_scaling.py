@@ -14,8 +14,7 @@ import pytest
 
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
-from studies.scaling.__main__ import RESULTS_FILE, measure, table
-from studies.scaling.spreading_cost import dask_cost
+from studies.scaling.__main__ import RESULTS_FILE, dask_cost, measure, table
 from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes
 
 PAGE = Path(__file__).resolve().parents[3] / "docs/how-to/scale-out.md"

@@ -9,7 +9,7 @@ import torch
 
 from droguekit.torch import RenderStream
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from studies.training_feed.epoch_feed import HEIGHT_PX, WIDTH_PX, Feed, feed_recipe, left_and_right, measure_epoch
+from studies.training_feed.__main__ import HEIGHT_PX, WIDTH_PX, Feed, feed_recipe, left_and_right, measure_epoch
 from tests.support.recipe_builder import RIG_160_PX, build_recipe
 from tests.support.small_datasets import SINGLE_PAIRS
 
