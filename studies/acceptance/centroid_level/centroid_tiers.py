@@ -1,4 +1,4 @@
-"""Tiers C, D and speed, at the level of centroids: noise, flips, covariances, tolerances, bad markers, and run times."""
+"""Tiers C, D and speed, at the level of centroids: noise, flips, covariances, tolerances, bad markers, run times."""
 
 from __future__ import annotations
 
