@@ -15,11 +15,13 @@ from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import navigate_dataset
 from droguekit.workflows.rendering import open_recipe, render_frames
 
-EXAMPLES = (
-    "droguekit demo",
-    "droguekit demo --out /tmp/look --workers 1",
-    "droguekit demo smoke --out out/smoke   (another recipe: six small pairs, in seconds)",
-)
+EXAMPLES = {
+    "demo": (
+        "droguekit demo",
+        "droguekit demo --out /tmp/look --workers 1",
+        "droguekit demo smoke --out out/smoke   (another recipe: six small pairs, in seconds)",
+    ),
+}
 
 # Once at each of the demo's ten distances, and a little more.
 _FIRST_PAIRS = 12

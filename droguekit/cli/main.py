@@ -21,7 +21,8 @@ class Command(NamedTuple):
     """One command.
 
     Attributes:
-        module: that holds the function of the command's name; imported only when the command is asked for.
+        module: that holds the function of the command's name, and its lines of `EXAMPLES`; imported only when the
+            command is asked for.
         summary: one line for the list of commands.
     """
 
@@ -30,38 +31,40 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "new": Command("droguekit.cli.dataset.new", "Write a commented drogue, rig or recipe to start from."),
+    "new": Command("droguekit.cli.dataset_commands", "Write a commented drogue, rig or recipe to start from."),
     "plan": Command(
-        "droguekit.cli.dataset.plan", "Show what a recipe will make, how long it takes and how large it gets."
+        "droguekit.cli.dataset_commands", "Show what a recipe will make, how long it takes and how large it gets."
     ),
     "check": Command(
-        "droguekit.cli.dataset.check", "Predict how well a recipe's markers can be measured, and what will fail."
+        "droguekit.cli.dataset_commands", "Predict how well a recipe's markers can be measured, and what will fail."
     ),
-    "render": Command("droguekit.cli.dataset.render", "Make a dataset from a recipe; continues where it stopped."),
-    "merge": Command("droguekit.cli.dataset.merge", "Join shards of a dataset into one."),
-    "import": Command("droguekit.cli.dataset.import_", "Make a dataset from real stereo images, without truth."),
-    "validate": Command("droguekit.cli.dataset.validate", "Check a dataset: files, hashes, labels against part ids."),
-    "reproduce": Command("droguekit.cli.dataset.reproduce", "Render one frame of a dataset again and compare."),
-    "export": Command("droguekit.cli.dataset.export", "Write a dataset's labels in another format."),
-    "preview": Command("droguekit.cli.viewing.preview", "Draw a contact sheet of a dataset with its labels."),
-    "browse": Command("droguekit.cli.viewing.browse", "Write a page to look through a dataset in a browser."),
-    "view": Command("droguekit.cli.viewing.view", "Show a dataset in the rerun viewer: images, labels, 3-D, errors."),
-    "detect": Command("droguekit.cli.navigation.detect", "Find the drogue in every image, without the truth."),
-    "train": Command("droguekit.cli.navigation.train", "Train a detector on datasets, evaluate and export it."),
+    "render": Command("droguekit.cli.dataset_commands", "Make a dataset from a recipe; continues where it stopped."),
+    "merge": Command("droguekit.cli.dataset_commands", "Join shards of a dataset into one."),
+    "import": Command("droguekit.cli.exchange_commands", "Make a dataset from real stereo images, without truth."),
+    "validate": Command("droguekit.cli.dataset_commands", "Check a dataset: files, hashes, labels against part ids."),
+    "reproduce": Command("droguekit.cli.dataset_commands", "Render one frame of a dataset again and compare."),
+    "export": Command("droguekit.cli.exchange_commands", "Write a dataset's labels in another format."),
+    "preview": Command("droguekit.cli.viewing_commands", "Draw a contact sheet of a dataset with its labels."),
+    "browse": Command("droguekit.cli.viewing_commands", "Write a page to look through a dataset in a browser."),
+    "view": Command(
+        "droguekit.cli.viewing_commands", "Show a dataset in the rerun viewer: images, labels, 3-D, errors."
+    ),
+    "detect": Command("droguekit.cli.navigation_commands", "Find the drogue in every image, without the truth."),
+    "train": Command("droguekit.cli.navigation_commands", "Train a detector on datasets, evaluate and export it."),
     "navigate": Command(
-        "droguekit.cli.navigation.navigate", "Estimate the drogue's pose in every pair, without the truth."
+        "droguekit.cli.navigation_commands", "Estimate the drogue's pose in every pair, without the truth."
     ),
     "benchmark": Command(
-        "droguekit.cli.navigation.benchmark", "Compare estimates with the truth: numbers and a report."
+        "droguekit.cli.navigation_commands", "Compare estimates with the truth: numbers and a report."
     ),
     "report": Command(
         "studies.paper.report_command",
         "Put our numbers beside the seed paper's: its tables and figures, as page and PDF.",
     ),
-    "model": Command("droguekit.cli.viewing.model", "Write the drogue as a mesh."),
+    "model": Command("droguekit.cli.viewing_commands", "Write the drogue as a mesh."),
     "demo": Command("droguekit.cli.demo", "Render a small dataset, navigate on it, and report."),
-    "bench": Command("droguekit.cli.bench", "Measure the CPU time of a pair by distance and stage."),
-    "doctor": Command("droguekit.cli.doctor", "Show what is installed and which engines work."),
+    "bench": Command("droguekit.cli.machine_commands", "Measure the CPU time of a pair by distance and stage."),
+    "doctor": Command("droguekit.cli.machine_commands", "Show what is installed and which engines work."),
 }
 # Studies are in the repository and not in the wheel: in a clone they lie beside this package.
 _STUDIES, _REPOSITORY = "studies.", Path(__file__).resolve().parents[2]
@@ -89,7 +92,7 @@ def load_command(name: str) -> Any:
         raise ValueError(f"{name}: is no part of the installed package; run it in a clone of the repository") from error
     # Some names are Python keywords, such as `import`.
     function = getattr(module, f"{name}_" if keyword.iskeyword(name) else name)
-    examples: tuple[str, ...] = getattr(module, "EXAMPLES", ())
+    examples: tuple[str, ...] = module.EXAMPLES[name]
     # The backspace keeps the help's line breaks.
     epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)

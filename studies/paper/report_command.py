@@ -13,11 +13,13 @@ from droguekit.cli.arguments import Place, output_option
 if TYPE_CHECKING:
     from studies.paper.paper_report import DatasetWithEstimates, ReportInputs
 
-EXAMPLES = (
-    "droguekit report --docking data/docking:docking.jsonl --html report.html",
-    "droguekit report --semi-physical data/bench-5:bench-5.jsonl --semi-physical data/bench-7:bench-7.jsonl \\",
-    "                 --detection detection.json --corpus data/corpus --html report.html --pdf report.pdf",
-)
+EXAMPLES = {
+    "report": (
+        "droguekit report --docking data/docking:docking.jsonl --html report.html",
+        "droguekit report --semi-physical data/bench-5:bench-5.jsonl --semi-physical data/bench-7:bench-7.jsonl \\",
+        "                 --detection detection.json --corpus data/corpus --html report.html --pdf report.pdf",
+    ),
+}
 
 
 def report(

@@ -1,1 +1,0 @@
-"""Commands that find the drogue and score what was found."""

@@ -1,1 +1,0 @@
-"""Commands that show datasets and models."""
