@@ -37,7 +37,7 @@ from drogue_models.procedural_maps import (
     stitches,
     streaks,
 )
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 from geometry.bilinear_sampling import sample_bilinear
 from geometry.se3 import Array
 

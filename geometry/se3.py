@@ -1,4 +1,8 @@
-"""Rigid transforms `a_from_b`, rotations, the drogue's attitude angles, and constant-twist motion."""
+"""Rigid transforms `a_from_b`, rotations, the drogue's attitude angles, constant-twist motion, and axes conventions.
+
+Optical (OpenCV): x right, y down, z forward. FRD (aviation bodies): forward, right, down. FLU (bodies of ROS REP-103):
+forward, left, up. ENU (the project's world): east, north, up. NED (aviation navigation): north, east, down.
+"""
 
 from __future__ import annotations
 
@@ -197,3 +201,8 @@ def left_jacobian(vector_rad: Array) -> Array:
         first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
     jacobian: Array = np.eye(3) + first * cross + second * cross @ cross
     return jacobian
+
+
+FRD_FROM_OPTICAL = RigidTransform(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
+FLU_FROM_FRD = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+NED_FROM_ENU = RigidTransform(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))

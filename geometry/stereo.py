@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.distortion import Lens, border_px
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import Array, RigidTransform, read_only
+from geometry.se3 import FRD_FROM_OPTICAL, Array, RigidTransform, read_only
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec, OtherDrogue
 from datasets_manifest.types.images import StereoImages
-from datasets_manifest.types.neighbours import OtherDrogue
 from datasets_manifest.types.records import (
     Conditions,
     FeatureView,

@@ -44,7 +44,7 @@ from nav.matching.ring_matching import (
 from nav.pair_measurement import PairMeasurement, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
-from nav.tracking.rim_boxes import rim_boxes
+from nav.tracking.region import rim_boxes
 
 Result = TypeVar("Result")
 # Sources of regions that are not a tracker's: the detector, or a prediction from the other eye.

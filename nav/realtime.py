@@ -30,7 +30,7 @@ from nav.centroids.blurred_edges import blurred_step
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
-from nav.pair_faults import unreadable_reason
+from nav.pair_measurement import unreadable_reason
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
 from nav.pose.marker_geometry import project_markers

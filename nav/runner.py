@@ -10,7 +10,7 @@ from drogue_models.marker_layout import marker_layout
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 from nav.docking import docking_quantities
 from nav.filtering.smoother import SMOOTHER_SUFFIX, smooth
-from nav.pair_faults import unreadable_reason
+from nav.pair_measurement import unreadable_reason
 from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.method_registry import method_names, pose_method
 from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair

@@ -22,8 +22,7 @@ from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
-from nav.pair_faults import fault_reason
-from nav.pair_measurement import PairMeasurement
+from nav.pair_measurement import PairMeasurement, fault_reason
 from nav.pair_navigator import CentroidChoice, PairNavigator
 from nav.pose.pose_method import NoFixReason
 from nav.tracked_detection import TrackedObserver

@@ -21,7 +21,7 @@ from nav.filtering.pose_filter import PoseFilter
 from nav.pair_measurement import PairMeasurement, regions_of
 from nav.pair_navigator import DETECTOR, PairNavigator
 from nav.pose.pose_method import Solution
-from nav.tracking.rim_boxes import rim_boxes
+from nav.tracking.region import rim_boxes
 from nav.tracking.tracker import REDETECT_EVERY, Tracker, begins_sequence, is_same_place, open_tracker
 
 # Where both eyes have lost the drogue the detector runs at once. Where one has, it runs at the second consecutive miss

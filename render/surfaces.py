@@ -27,7 +27,7 @@ from drogue_models.parts import (
     Part,
     part_reflectance_rgb,
 )
-from drogue_models.surroundings.bystander_surface import bystander_surface
+from drogue_models.surroundings.bystanders import bystander_surface
 from drogue_models.surroundings.hose_surface import hose_surface
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from drogue_models.tankers.wing_with_pod import POD_LENGTH_M, POD_RADIUS_M, wing_surfaces

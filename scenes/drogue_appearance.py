@@ -9,7 +9,7 @@ from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, WearRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from drogue_models.parameters import DrogueParameters
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 from scenes.environment_sampling import sample_uniform
 
 # Three markers determine a pose; fewer could not be distinguished from other things.

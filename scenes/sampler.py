@@ -13,7 +13,7 @@ from datasets_manifest.types.appearance import PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters
-from drogue_models.surroundings.hose_look import HoseLook
+from drogue_models.surface_looks import HoseLook
 from drogue_models.tankers.tanker import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
@@ -21,10 +21,9 @@ from scenes.camera_sampling import camera_of_scene
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
-from scenes.flight.frame_kinematics import FrameKinematics
 from scenes.flight.sequence import sequence_kinematics
 from scenes.flight.suspension import hang_hose, hose_look_of_scene, hose_of_scene, sample_suspension
-from scenes.flight.trajectory import sample_attitude
+from scenes.flight.trajectory import FrameKinematics, sample_attitude
 from scenes.framing import outline_points_m, sample_distance_m, sample_pose
 from scenes.sky.photometry import luminance
 from scenes.surroundings.bystander_sampling import bystanders_of_frame

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.recipe.aircraft_ranges import TankerRanges
 from datasets_manifest.recipe.recipe import Recipe
-from datasets_manifest.recipe.tanker_ranges import TankerRanges
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tankers.tanker import PROPELLERS, Tanker
 from geometry.se3 import Array, RigidTransform

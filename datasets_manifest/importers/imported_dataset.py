@@ -28,8 +28,7 @@ from datasets_manifest.storage.layout import (
 )
 from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.frame import Sensor
-from datasets_manifest.types.images import Pixels
-from datasets_manifest.types.pixel_values import PixelValues
+from datasets_manifest.types.images import Pixels, PixelValues
 from datasets_manifest.types.records import PixelBox
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, StereoRig

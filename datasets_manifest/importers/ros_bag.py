@@ -18,7 +18,7 @@ from datasets_manifest.importers.bag_chunks import check_chunks
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.ros_images import RosImage, decode_image, message_stamp_ns
 from datasets_manifest.importers.stamp_pairs import match_stamps, smallest_difference_ns
-from datasets_manifest.types.pixel_values import PIXEL_VALUES_TOPIC, PixelValues, parse_pixel_values
+from datasets_manifest.types.images import PIXEL_VALUES_TOPIC, PixelValues, parse_pixel_values
 from geometry.se3 import Array
 from geometry.stereo import EYES, StereoRig
 

@@ -11,15 +11,12 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.recipe.aircraft_ranges import HoseRanges, NeighbourRanges, ReceiverRanges, TankerRanges
 from datasets_manifest.recipe.camera_ranges import CameraRanges
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
-from datasets_manifest.recipe.hose_ranges import HoseRanges
-from datasets_manifest.recipe.neighbour_ranges import NeighbourRanges
-from datasets_manifest.recipe.receiver_ranges import ReceiverRanges
 from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, load_rig, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_single_frame_keys, fill_distance
-from datasets_manifest.recipe.tanker_ranges import TankerRanges
 from datasets_manifest.types.appearance import CalibrationBoard
 from datasets_manifest.types.environment import pin_environment_map
 from datasets_manifest.types.field_types import Fraction, Rig

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from datasets_manifest.storage.manifest import Manifest
-from datasets_manifest.storage.provenance import differing_builds
+from datasets_manifest.storage.manifest import Manifest, differing_builds
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import canonical_json

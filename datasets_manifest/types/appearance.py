@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from datasets_manifest.types.field_types import Transform
 from drogue_models.frozen_model import FrozenModel, Reflectance, ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 from geometry.se3 import Array
 
 

@@ -10,14 +10,35 @@ from pydantic import Field, model_validator
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
-from datasets_manifest.types.neighbours import OtherDrogue
 from datasets_manifest.types.video_camera import VideoCamera
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import MAX_NEIGHBOURS
-from drogue_models.surroundings.hose_look import HoseLook
+from drogue_models.surface_looks import HoseLook
 from drogue_models.tankers.tanker import Tanker
 from geometry.se3 import RigidTransform, exp_twist
+
+
+class OtherDrogue(FrozenModel):
+    """Another hose and drogue; during the exposure it moves with the drogue that is sought.
+
+    Attributes:
+        drogue: its dimensions and paint.
+        condition: of its surfaces, or None when it is as new.
+        left_from_drogue: pose at mid-exposure.
+        hose_nodes_left_m: (K, 3) centre line of its hose from coupling to exit in the left camera. [m]
+        hose_look: paint of its hose, or None for the drogue's structural paint.
+        left_from_tanker: pose of the second tanker, of the first one's type, that its hose comes from; None where it
+            comes from the first one.
+    """
+
+    drogue: DrogueParameters
+    condition: DrogueCondition | None = None
+    left_from_drogue: Transform
+    hose_nodes_left_m: Points3
+    hose_look: HoseLook | None = None
+    left_from_tanker: Transform | None = Field(default=None, exclude_if=lambda pose: pose is None)
+
 
 DropoutKind = Literal["occlusion", "out-of-view", "glare"]
 

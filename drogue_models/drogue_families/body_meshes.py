@@ -8,16 +8,14 @@ from numpy.typing import NDArray
 
 from drogue_models.bodies import BasketBody, BodyLine, Canopy, ConeBody, PetalBody, RibbonBody
 from drogue_models.drogue_families.fittings import (
+    around_axis,
     hub_annulus,
     lamps,
+    line_points_m,
     marker_holders,
     marker_plate,
     reception_coupling,
     rim,
-)
-from drogue_models.drogue_families.shells import (
-    around_axis,
-    line_points_m,
     share_at_m,
     shell,
     strut,

@@ -9,7 +9,7 @@ from drogue_models.meshes import HOSE_SECTIONS, hose_mesh
 from drogue_models.painted_mesh import HIGHEST_REFLECTANCE, LOWEST_REFLECTANCE, PaintedMesh, Sheen
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part, part_reflectance_rgb
-from drogue_models.surroundings.hose_look import HoseLook
+from drogue_models.surface_looks import HoseLook
 
 # Texels along and around a hose; 25 m of it have one each 2.4 cm.
 _ROWS, _COLUMNS = 1024, 8

@@ -9,11 +9,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from drogue_models.painted_mesh import PaintedMesh
-from drogue_models.tankers.aircraft_paint import paint_aircraft
+from drogue_models.tankers.aircraft_paint import SCHEMES, paint_aircraft
 from drogue_models.tankers.airframe import Place
 from drogue_models.tankers.atlas import Chart, lay_out
 from drogue_models.tankers.equipment import POD_TAIL_RADIUS_M, TUNNEL_RADIUS_M, lamp_mesh, rotor_mesh, stowed_drogue
-from drogue_models.tankers.paint_schemes import SCHEMES
 from drogue_models.tankers.planforms import airframe, grid_mesh, joined_mesh
 from drogue_models.tankers.tanker import PaintScheme, Tanker, TankerType
 from geometry.se3 import Array

@@ -24,8 +24,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import Drop
 from datasets_manifest.storage.reader import read_record_table
-from droguekit.batch.failure_policy import FATAL_ERRORS, make_drop
-from droguekit.batch.frame_task import FrameReport, FrameTask
+from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop
 from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array

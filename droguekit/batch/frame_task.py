@@ -1,6 +1,7 @@
 """One frame from the recipe to its files: the unit of work that a worker process repeats.
 
-`reproduce_frame` makes a frame of a dataset once more, and compares it with the stored one.
+`reproduce_frame` makes a frame of a dataset once more, and compares it with the stored one. `make_drop` takes an error that
+ends a single frame; others end the run, because other frames would fail too.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_passes
 from datasets_manifest.storage.layout import RECORD_FILE, frame_folder, passes_file
+from datasets_manifest.storage.manifest import Drop, cpu_features, differing_builds, software_versions
 from datasets_manifest.storage.packing import Packing, pack_if_complete
-from datasets_manifest.storage.provenance import cpu_features, differing_builds, software_versions
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import encode_files, write_frame
@@ -37,7 +38,7 @@ from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from render.device import Device
-from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
+from render.engine import EngineUnavailableError, EyeRadiance, RenderEngine, StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 
 
@@ -322,3 +323,19 @@ def _differences(old: Any, new: Any, pixels_too: bool, where: str = "") -> tuple
 def _shortened(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:37] + "..."
+
+
+# Errors of machine or storage, which other frames would meet too.
+FATAL_ERRORS = (OSError, EngineUnavailableError, OtherBuildError)
+# If so many first frames of a run all fail, whatever the error, the recipe is at fault.
+FIRST_FRAMES = 3
+
+
+def error_reason(error: BaseException) -> str:
+    """The message of an error on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def make_drop(frame_index: int, error: BaseException) -> Drop:
+    """Record that a frame is dropped because of an error."""
+    return Drop(frame_index=frame_index, reason=error_reason(error))

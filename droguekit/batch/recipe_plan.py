@@ -18,7 +18,7 @@ from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Drop
 from drogue_models.parameters import DrogueParameters
-from droguekit.batch.failure_policy import FIRST_FRAMES, make_drop
+from droguekit.batch.frame_task import FIRST_FRAMES, make_drop
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig

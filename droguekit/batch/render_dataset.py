@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, TextIO
 
 from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
-from datasets_manifest.release.card import write_card
-from datasets_manifest.release.croissant import write_croissant
+from datasets_manifest.release.card import write_card, write_croissant
 from datasets_manifest.storage.frame_store import list_frames
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECIPE_FILE
 from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, read_manifest, with_build, write_manifest
@@ -21,13 +20,19 @@ from datasets_manifest.storage.packing import read_packing
 from datasets_manifest.storage.storage import Location, join, open_storage
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
 from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
-from droguekit.batch.failure_policy import FATAL_ERRORS, FIRST_FRAMES, error_reason
-from droguekit.batch.frame_task import FrameReport, FrameTask
+from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, FrameTask, error_reason
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
 from droguekit.batch.resume import check_frames, finish_frames, open_dataset
-from droguekit.batch.stop_request import StopRequest
-from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerDiedError, WorkerLimits, is_accident, run_tasks
+from droguekit.batch.worker_pool import (
+    MAX_ATTEMPTS,
+    StopRequest,
+    TaskAttempt,
+    WorkerDiedError,
+    WorkerLimits,
+    is_accident,
+    run_tasks,
+)
 from labelgen.export.annotations.coco import write_annotations
 from render.engine import crash_advice, engine_notice
 from render.version import RENDER_VERSION

@@ -54,7 +54,7 @@ def doctor(
     from droguekit.workflows.installation import installation_lines
 
     if make_blender:
-        from droguekit.workflows.blender_environment import make_blender as steps
+        from droguekit.workflows.installation import make_blender as steps
 
         for line in steps():
             typer.echo(line)

@@ -166,8 +166,7 @@ def view(
     from datasets_manifest.types.estimates import read_estimates
     from droguekit.batch.progress import progress_report
     from droguekit.scoring.poses.pose_errors import estimates_by_method
-    from droguekit.visualization.rerun_viewer.recording import open_pairs
-    from droguekit.visualization.rerun_viewer.session import view_pairs
+    from droguekit.visualization.rerun_viewer import open_pairs, view_pairs
 
     source = open_pairs(dataset)
     if not source.frame_indices:

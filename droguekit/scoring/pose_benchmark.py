@@ -25,13 +25,7 @@ from droguekit.scoring.poses.method_scores import (
 )
 from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.scoring.poses.reference import DistanceBin, Reference, build_reference, distance_bins
-from droguekit.scoring.results.benchmark_result import (
-    BenchmarkResult,
-    DatasetFacts,
-    EmptyFrames,
-    MethodResult,
-    PoseBin,
-)
+from droguekit.scoring.results.benchmark_result import BenchmarkResult, DatasetFacts, EmptyFrames, MethodResult, PoseBin
 from droguekit.scoring.results.pose_result import MethodComparison
 from droguekit.scoring.results.sequence_result import HiddenPairs, MethodSequences, SequencesResult
 from droguekit.scoring.sequences.docking_errors import docking_errors, true_dockings

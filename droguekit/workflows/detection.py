@@ -76,7 +76,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         KeyboardInterrupt: the user asked to stop, and the state is saved.
     """
     from datasets_manifest.recipe.recipe import RecipeSource
-    from droguekit.batch.stop_request import StopRequest
+    from droguekit.batch.worker_pool import StopRequest
     from nav.training.training_settings import build_settings, parse_size
 
     changes = {name: value for name, value in options.changes.items() if value is not None}
@@ -87,7 +87,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
     # Otherwise torch's threads wait by spinning, which wastes time where other processes use the cores too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from nav.training.starting_weights import read_starting_weights
+    from nav.training.training_state import read_starting_weights
 
     start = None if options.start_from is None else read_starting_weights(options.start_from)
     network = None if start is None or start.network is None else start.network.to_dict()

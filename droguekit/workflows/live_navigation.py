@@ -26,7 +26,7 @@ from droguekit.workflows.navigation import (
     sequence_settings,
     tallied,
 )
-from nav.pair_faults import PairFaults
+from nav.pair_measurement import PairFaults
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from droguekit.workflows.estimate_file import EstimateFile
-from nav.pair_faults import PairFaults
+from nav.pair_measurement import PairFaults
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.blind import BlindDataset

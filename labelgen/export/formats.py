@@ -58,17 +58,19 @@ FORMATS: dict[str, ExportFormat] = {
     "yolo-detect": ExportFormat(
         "ultralytics boxes of drogue, markers and hub", "labelgen.export.annotations.yolo:write_yolo_detect"
     ),
-    "cvat": ExportFormat("CVAT for images 1.1: boxes, masks and points", "labelgen.export.annotations.cvat:write_cvat"),
+    "cvat": ExportFormat(
+        "CVAT for images 1.1: boxes, masks and points", "labelgen.export.annotations.annotation_tools:write_cvat"
+    ),
     "label-studio": ExportFormat(
         "Label Studio tasks: boxes, polygons and keypoints",
-        "labelgen.export.annotations.label_studio:write_label_studio",
+        "labelgen.export.annotations.annotation_tools:write_label_studio",
     ),
     "fiftyone": ExportFormat(
         "FiftyOne stereo groups: detections with masks, keypoints",
-        "labelgen.export.annotations.fiftyone_samples:write_fiftyone",
+        "labelgen.export.annotations.annotation_tools:write_fiftyone",
     ),
     "speed": ExportFormat(
-        "SPEED+ pose lists and camera, a folder an eye", "labelgen.export.poses.pose_lists:write_speed"
+        "SPEED+ pose lists and camera, a folder an eye", "labelgen.export.poses.pose_files:write_speed"
     ),
     "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.poses.kitti:write_kitti"),
     "webdataset": ExportFormat(
@@ -85,13 +87,13 @@ FORMATS: dict[str, ExportFormat] = {
     ),
     "tum": ExportFormat(
         "trajectories as TUM text: the truth, and estimates beside it for evo",
-        "labelgen.export.poses.trajectories:write_tum",
+        "labelgen.export.poses.pose_files:write_tum",
         takes_estimates=True,
     ),
     "bop": ExportFormat(
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.poses.bop:write_bop"
     ),
-    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.annotations.mask_images:write_masks"),
+    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.annotations.part_masks:write_masks"),
     "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.poses.calibration_export:write_opencv"),
     "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.poses.calibration_export:write_kalibr"),
     "ros-camera-info": ExportFormat(

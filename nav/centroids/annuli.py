@@ -37,8 +37,7 @@ from nav.centroids.motion_blur import ImageMotion, blurred_share_outside, motion
 from nav.centroids.outline_pixels import OutlinePixels, annulus_pixels, edge_distances
 from nav.centroids.pixel_response import RESPONSE_BOXES
 from nav.numerics.compiled import Array32
-from nav.numerics.least_squares_loops import constrain_jacobian
-from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations, evaluate, minimise
+from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations, constrain_jacobian, evaluate, minimise
 
 SLOPE_HARMONICS = 5
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
-from nav.matching.blobs import Blobs, disc_like_blobs
-from nav.matching.marker_channel import Window
+from nav.matching.marker_channel import Blobs, Window, disc_like_blobs
 from nav.matching.ring_matching import RingMatch, match_ring
 
 # Share of the box added on every side, so that a slightly small box cuts no marker.

@@ -15,7 +15,7 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.ellipses import shape_inverses
 from nav.numerics.compiled import Array32, compiled, float_of_bits
-from nav.numerics.least_squares_loops import add_row, multiply_rows
+from nav.numerics.levenberg_marquardt import add_row, multiply_rows
 
 # Indices into the parameter vectors. The ellipse comes first: centre x, y; elements xx, yy, xy of the inverse shape.
 ELLIPSE_PARAMETER_COUNT = 5

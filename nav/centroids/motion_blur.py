@@ -16,8 +16,7 @@ from nav.centroids.ellipses import Ellipses
 from nav.centroids.outline_pixels import OutlinePixels, edge_distances
 from nav.centroids.pixel_response import reduced_equations, solve_shared
 from nav.numerics.compiled import Array32
-from nav.numerics.least_squares_loops import add_rows
-from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
+from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations, add_rows
 
 # The fit of a still edge follows shorter motions, and noise hides them. [px]
 _LEAST_TRAVEL_PX = 1.0

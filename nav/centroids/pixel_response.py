@@ -15,8 +15,7 @@ from geometry.se3 import Array
 from nav.centroids.blurred_edges import ELLIPSE_PARAMETER_COUNT, add_box_responses
 from nav.centroids.outline_pixels import OutlinePixels
 from nav.numerics.compiled import Array32
-from nav.numerics.least_squares_loops import add_rows, normal_equations, weighted_products
-from nav.numerics.levenberg_marquardt import Minimum
+from nav.numerics.levenberg_marquardt import Minimum, add_rows, normal_equations, weighted_products
 
 # Added to a normal matrix with unit diagonal: dim light does not separate the shared amounts.
 _RIDGE = 1e-3

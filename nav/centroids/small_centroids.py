@@ -12,7 +12,7 @@ from datasets_manifest.types.images import Pixels
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from nav.centroids.binary_centroids import NO_CENTROIDS, BinaryCentroids
-from nav.matching.blobs import Blobs
+from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import match_ring
 
 # Spread of a point's light by lens and pixel. [px]

@@ -12,8 +12,7 @@ from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
-from nav.matching.blobs import disc_like_blobs
-from nav.matching.marker_channel import OTHERS_WEIGHTS, marker_channel, marker_color
+from nav.matching.marker_channel import OTHERS_WEIGHTS, disc_like_blobs, marker_channel, marker_color
 from nav.matching.ring_matching import RingMatch, match_ring
 
 # A marker of 5 px diameter covers about 20 pixels; after blurring, half of them stay above half its contrast.

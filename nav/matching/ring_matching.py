@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
-from nav.matching.blobs import Blobs
+from nav.matching.marker_channel import Blobs
 
 # Blurring and thresholds change a disc's apparent radius by less than this factor at 5 px of diameter.
 _SIZE_FACTOR = 1.6

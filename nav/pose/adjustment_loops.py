@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.numerics.compiled import compiled
-from nav.numerics.least_squares_loops import solve_damped
+from nav.numerics.levenberg_marquardt import solve_damped
 
 _ITERATIONS = 20
 # Keeps the normal equations of a frontal, far drogue solvable; far below the information of any marker.

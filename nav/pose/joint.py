@@ -1,19 +1,312 @@
-"""Methods `joint`, `joint-hub` and `joint-robust`: the pose that best explains the features in both eyes at once."""
+"""Methods `joint`, `joint-hub` and `joint-robust`: the pose that best explains the features in both eyes at once.
+
+Many frames are adjusted at once, each from two starts, tilted one way and the other, because a flat pattern far away
+allows both. Where the ring alone does not tell which tilt is right, the reported pose is the posterior's mean over
+both, with the covariance of the mixture. Elsewhere it is the minimum with the lower cost, with the inverse information
+as covariance.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
-from nav.pose.adjustment import AdjustedPoses, AdjustmentState, Loss, adjust, linearise, project_features
-from nav.pose.features import Features, observed_features
-from nav.pose.joint_batch import JointBatch, adjust_both_tilts, solve_features, two_fold_starts
-from nav.pose.observation_checks import hub_fault, stereo_fault
-from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
+from geometry.stereo import StereoRig
+from nav.pose.adjustment import (
+    SQUARED_LOSS,
+    AdjustedPoses,
+    AdjustmentState,
+    Loss,
+    adjust,
+    information_at,
+    inverse_information,
+    linearise,
+    project_features,
+)
+from nav.pose.features import Features, observed_features, stack_features
+from nav.pose.pose_method import (
+    EXACT,
+    NoFixReason,
+    Observation,
+    PoseMode,
+    Solution,
+    StatedTolerances,
+    hub_fault,
+    stereo_fault,
+)
+
+# Standard deviation of pitch and of yaw for drogues that swing uniformly within 10 degrees: 5.8 degrees.
+TILT_PRIOR_RAD = np.radians(6.0)
+# The sign of a tilt is reliable beyond this many standard deviations of the tilt of a frontal drogue: wrong in 0.1 %.
+_RELIABLE_SIGMAS = 3.0
+# Starts that end closer to each other than this found one minimum.
+_SAME_TURN_RAD = 1e-4
+# Keeps the affine fit of collinear markers solvable; negligible for all others.
+_RIDGE_FRACTION = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class JointBatch:
+    """Poses of B frames.
+
+    Attributes:
+        rotations: (B, 3, 3) `left_from_drogue`.
+        translations_m: (B, 3).
+        covariances: (B, 6, 6) in the tangent of `datasets_manifest.types.estimates`.
+        sound: (B,) whether the measurements determine a pose in front of the cameras; the other values of a frame are
+            meaningless where they do not.
+        tilt_sign_reliable: (B,) whether the tilt is large enough for its sign to be certain.
+        mode_rotations: (B, 2, 3, 3) the poses from both starts, the best first.
+        mode_translations_m: (B, 2, 3).
+        mode_costs: (B, 2) half the sum of squared residuals in standard deviations, priors included.
+        mode_weights: (B, 2) posterior probabilities; the second is 0 where both starts led to the same pose.
+    """
+
+    rotations: Array
+    translations_m: Array
+    covariances: Array
+    sound: NDArray[np.bool_]
+    tilt_sign_reliable: NDArray[np.bool_]
+    mode_rotations: Array
+    mode_translations_m: Array
+    mode_costs: Array
+    mode_weights: Array
+
+
+def solve_joint_batch(
+    rig: StereoRig, layout: MarkerLayout, pixels_px: Array, cov_px2: Array, tolerances: StatedTolerances = EXACT
+) -> JointBatch:
+    """Methods `joint` and, with the hub's edges among the pixels, `joint-hub`, for many frames of one drogue.
+
+    Args:
+        rig: the stereo rig.
+        layout: the drogue's markers and hub.
+        pixels_px: (B, E, F, 2) measured ellipse centres, nan where there is none; E = 1 (left eye) or 2, F = N markers,
+            or N + 2 with the hub's inner and outer edge.
+        cov_px2: (B, E, F, 2, 2) their covariances, or what broadcasts to it.
+        tolerances: of drogue and rig.
+
+    Raises:
+        ValueError: an array of another shape.
+    """
+    return solve_features(stack_features(rig, layout, pixels_px, cov_px2, tolerances))
+
+
+def solve_features(features: Features) -> JointBatch:
+    """As `solve_joint_batch`, from stacked features."""
+    tilts = _TiltPairs.of(adjust_both_tilts(features, *two_fold_starts(features)))
+    tilts = tilts.ordered(np.argsort(tilts.costs, axis=1, kind="stable"))
+    best_rotations, best_translations = tilts.rotations[:, 0], tilts.translations_m[:, 0]
+    covariances, sound = inverse_information(tilts.information[:, 0])
+    sound &= np.isfinite(tilts.costs[:, 0]) & (best_rotations[:, 2, 2] > 0) & (best_translations[:, 2] > 0)
+    weights = _mode_weights(tilts, TILT_PRIOR_RAD)
+    reliable = _tilt_sign_reliable(features, best_rotations, best_translations) | ~sound
+
+    rotations, translations = best_rotations.copy(), best_translations.copy()
+    ambiguous = np.flatnonzero(~reliable)
+    if len(ambiguous):
+        starts = (tilts.rotations[ambiguous], tilts.translations_m[ambiguous])
+        with_prior, prior_weights = _adjust_with_tilt_prior(features.take(ambiguous), *starts)
+        rotations[ambiguous], translations[ambiguous], covariances[ambiguous] = _mixture_mean(with_prior, prior_weights)
+        tilts.replace(ambiguous, with_prior)
+        weights[ambiguous] = prior_weights
+    return JointBatch(
+        rotations=rotations,
+        translations_m=translations,
+        covariances=covariances,
+        sound=sound,
+        tilt_sign_reliable=reliable & sound,
+        mode_rotations=tilts.rotations,
+        mode_translations_m=tilts.translations_m,
+        mode_costs=tilts.costs,
+        mode_weights=weights,
+    )
+
+
+def _adjust_with_tilt_prior(features: Features, rotations: Array, translations_m: Array) -> tuple[_TiltPairs, Array]:
+    """Adjust (B, 2) starts with the prior on the tilt, and order both by their weights (B, 2), the larger first."""
+    tilts = _TiltPairs.of(adjust_both_tilts(features, rotations, translations_m, Loss(tilt_prior_rad=TILT_PRIOR_RAD)))
+    weights = _mode_weights(tilts, np.inf)
+    order = np.argsort(-weights, axis=1, kind="stable")
+    return tilts.ordered(order), np.take_along_axis(weights, order, axis=1)
+
+
+def adjust_both_tilts(
+    features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARED_LOSS
+) -> AdjustedPoses:
+    """Adjust (B, 2) starts; returns 2 B poses, the two of a frame after each other."""
+    twice = features.take(np.repeat(np.arange(features.frames), 2))
+    return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
+
+
+def two_fold_starts(features: Features) -> tuple[Array, Array]:
+    """Both weak-perspective poses of the ring's markers that every eye measured.
+
+    The affine map from the rim plane to the image, averaged over the eyes, is scale times the first two columns of the
+    attitude without their third components. The common sign of these is undetermined, hence two poses.
+
+    Args:
+        features: B frames with at least three markers that all eyes measured, and that are not collinear.
+
+    Returns:
+        rotations (B, 2, 3, 3) `left_from_drogue`, translations (B, 2, 3). [m]
+    """
+    camera = features.camera
+    linear_px, center_px = _fit_affine_maps(features)
+    # Rays with z = 1: the affine map in units of the focal length.
+    linear = linear_px / np.array([camera.fx_px, camera.fy_px])[:, None]
+    direction = camera.rays(center_px)
+    scale = _largest_singular_values(linear)
+    # Coincident markers have no scale; any value works, since the cost of the adjustment is high anyway.
+    scale = np.maximum(scale, np.finfo(np.float64).tiny ** 0.5)
+    translation = direction / scale[:, None]
+    translation[:, 0] += features.eye_x_m.mean()
+
+    columns = np.empty((len(scale), 2, 3, 2))
+    columns[:, :, :2] = (linear / scale[:, None, None])[:, None]
+    in_plane = columns[:, 0, :2]
+    third = np.sqrt(np.maximum(0.0, 1 - (in_plane**2).sum(axis=1)))
+    third[:, 1] = -np.copysign(
+        third[:, 1], in_plane[:, 0, 0] * in_plane[:, 0, 1] + in_plane[:, 1, 0] * in_plane[:, 1, 1]
+    )
+    columns[:, 0, 2], columns[:, 1, 2] = third, -third
+    rotations = line_of_sight_rotations(direction)[:, None] @ _nearest_rotations(columns)
+    return rotations, np.repeat(translation[:, None], 2, axis=1)
+
+
+def line_of_sight_rotations(directions: Array) -> Array:
+    """(B, 3, 3) smallest rotations from the optical axis to (B, 3) directions with positive z."""
+    line_of_sight = directions / np.sqrt((directions**2).sum(axis=1, keepdims=True))
+    x, y, z = line_of_sight.T
+    rotations = np.empty((len(line_of_sight), 3, 3))
+    rotations[:, :, 2] = line_of_sight
+    rotations[:, 2, 0], rotations[:, 2, 1] = -x, -y
+    rotations[:, 0, 0], rotations[:, 1, 1] = 1 - x * x / (1 + z), 1 - y * y / (1 + z)
+    rotations[:, 0, 1] = rotations[:, 1, 0] = -x * y / (1 + z)
+    return rotations
+
+
+def _fit_affine_maps(features: Features) -> tuple[Array, Array]:
+    """Affine maps from rim plane to mean image: (B, 2, 2) linear parts, (B, 2) images of the drogue's origin. [px]"""
+    paired = (features.seen.all(axis=1) & features.is_marker).astype(np.float64)
+    cyclopean = features.measured[:2].mean(axis=2).transpose(1, 2, 0)
+    total = np.maximum(paired.sum(axis=1), 1)[:, None]
+    positions = features.points_m[:, :2]
+    mean_position = paired @ positions / total
+    mean_px = (paired[..., None] * cyclopean).sum(axis=1) / total
+    centred = (positions - mean_position[:, None]) * paired[..., None]
+    normal = centred.transpose(0, 2, 1) @ centred
+    ridge = _RIDGE_FRACTION * (normal[:, 0, 0] + normal[:, 1, 1]) + np.finfo(np.float64).tiny
+    normal += ridge[:, None, None] * np.eye(2)
+    moments = centred.transpose(0, 2, 1) @ (cyclopean - mean_px[:, None])
+    linear = np.linalg.solve(normal, moments).transpose(0, 2, 1)
+    return linear, mean_px - (linear @ mean_position[..., None])[..., 0]
+
+
+def _nearest_rotations(columns: Array) -> Array:
+    """(..., 3, 3) rotations whose first two columns are nearest to two nearly orthonormal ones (..., 3, 2)."""
+    rotations = np.empty((*columns.shape[:-1], 3))
+    u, _, vt = np.linalg.svd(columns, full_matrices=False)
+    np.matmul(u, vt, out=rotations[..., :2])
+    rotations[..., 2] = cross(rotations[..., 0], rotations[..., 1])
+    return rotations
+
+
+def cross(first: Array, second: Array) -> Array:
+    """(..., 3) cross products; for small arrays several times as fast as `numpy.cross`."""
+    ax, ay, az, bx, by, bz = (vectors[..., axis] for vectors in (first, second) for axis in range(3))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def _largest_singular_values(linear: Array) -> Array:
+    """(B,) largest singular values of (B, 2, 2) maps."""
+    (a, b), (c, d) = linear.transpose(1, 2, 0)
+    singular_values: Array = (np.hypot(a + d, b - c) + np.hypot(a - d, b + c)) / 2
+    return singular_values
+
+
+@dataclass(frozen=True, eq=False)
+class _TiltPairs:
+    """Adjusted poses from both starts of B frames, (B, 2, ...)."""
+
+    rotations: Array
+    translations_m: Array
+    costs: Array
+    information: Array
+
+    @staticmethod
+    def of(adjusted: AdjustedPoses) -> _TiltPairs:
+        size = adjusted.information.shape[-1]
+        return _TiltPairs(
+            adjusted.rotations.reshape(-1, 2, 3, 3),
+            adjusted.translations_m.reshape(-1, 2, 3),
+            adjusted.costs.reshape(-1, 2),
+            adjusted.information.reshape(-1, 2, size, size),
+        )
+
+    def ordered(self, order: NDArray[np.int64]) -> _TiltPairs:
+        rows = np.arange(len(order))[:, None]
+        return _TiltPairs(*(values[rows, order] for values in vars(self).values()))
+
+    def replace(self, frames: NDArray[np.int64], other: _TiltPairs) -> None:
+        for own, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
+            own[frames] = replacement
+
+
+def _mode_weights(pairs: _TiltPairs, prior_rad: float) -> Array:
+    """(B, 2) posterior probabilities by Laplace's approximation, `exp(-cost) |information|^(-1/2)` times a tilt prior.
+
+    They are zero for a pose behind the cameras and for the second of two equal poses.
+    """
+    axes = pairs.rotations[..., 2]
+    with np.errstate(invalid="ignore"):
+        log_weights = -pairs.costs - np.linalg.slogdet(pairs.information)[1] / 2
+    log_weights -= (axes[..., :2] ** 2).sum(axis=-1) / (2 * prior_rad**2)
+    possible = np.isfinite(log_weights) & (axes[..., 2] > 0) & (pairs.translations_m[..., 2] > 0)
+    possible[:, 1] &= np.linalg.norm(axes[:, 0] - axes[:, 1], axis=-1) > _SAME_TURN_RAD
+    # A frame with only impossible poses keeps the first, which is not sound.
+    possible[:, 0] |= ~possible.any(axis=1)
+    log_weights = np.where(possible, np.where(np.isfinite(log_weights), log_weights, 0.0), -np.inf)
+    relative = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    weights: Array = relative / relative.sum(axis=1, keepdims=True)
+    return weights
+
+
+def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Array) -> NDArray[np.bool_]:
+    """(B,) whether the tilt against the line of sight exceeds three standard deviations of that of a frontal pose."""
+    middle = np.array([features.eye_x_m.mean(), 0.0, 0.0])
+    frontal = line_of_sight_rotations(translations_m - middle)
+    covariance, determined = inverse_information(information_at(features, frontal, translations_m))
+    variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
+    # The cosine of small tilts is lost in rounding; the cross product is not.
+    tilt = np.sqrt((cross(rotations[:, :, 2], frontal[:, :, 2]) ** 2).sum(axis=1))
+    reliable: NDArray[np.bool_] = determined & (tilt > _RELIABLE_SIGMAS * np.sqrt(variance))
+    return reliable
+
+
+def _mixture_mean(pairs: _TiltPairs, weights: Array) -> tuple[Array, Array, Array]:
+    """Mean rotations (B, 3, 3), translations (B, 3) and covariances (B, 6, 6) of mixtures of two Gaussians."""
+    count, size = len(weights), pairs.information.shape[-1]
+    first = pairs.rotations[:, 0]
+    turn_between = Rotation.from_matrix(pairs.rotations[:, 1] @ np.swapaxes(first, 1, 2)).as_rotvec()
+    turn = np.zeros((count, 2, 3))
+    turn[:, 1] = np.where(weights[:, 1:] > 0, turn_between, 0.0)
+    positions = np.concatenate([pairs.translations_m, turn], axis=-1)
+    mean = (weights[..., None] * positions).sum(axis=1)
+    offsets = np.where(weights[..., None] > 0, positions - mean[:, None], 0.0)
+    spreads, _ = inverse_information(pairs.information.reshape(-1, size, size))
+    spreads = spreads.reshape(count, 2, 6, 6) + offsets[..., :, None] * offsets[..., None, :]
+    covariance = (weights[..., None, None] * spreads).sum(axis=1)
+    rotations = Rotation.from_rotvec(mean[:, 3:]).as_matrix() @ first
+    return rotations, mean[:, :3], covariance
+
 
 # Largest root mean square residual of a drogue's features: a share of a marker's radius, and at least these pixels.
 _LARGEST_MISS_FRACTION = 0.5
@@ -32,7 +325,7 @@ _LEAST_INLIERS = 4
 def joint(observation: Observation) -> Solution | NoFixReason:
     """Method `joint`: weighted least squares over all markers in both eyes, from both weak-perspective attitudes.
 
-    See `nav.pose.joint_batch` for the pose where the sign of the tilt is ambiguous.
+    See `nav.pose.joint` for the pose where the sign of the tilt is ambiguous.
     """
     return stereo_fault(observation) or solve_one(observed_features(observation, with_hub=False), observation.seen)
 

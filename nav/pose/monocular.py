@@ -28,8 +28,7 @@ from nav.pose.adjustment import AdjustedPoses, AdjustmentState, adjust, informat
 from nav.pose.features import Features, left_features, stack_features
 from nav.pose.joint import misfit_reason, solve_one
 from nav.pose.marker_geometry import align_roll, left_mask, project_markers, rotations_from_axes
-from nav.pose.observation_checks import eye_fault, hub_fault
-from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, PoseMode, Solution
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, PoseMode, Solution, eye_fault, hub_fault
 
 _LEFT, _RIGHT = range(2)
 # Three image points have up to four poses.

@@ -1,7 +1,8 @@
-"""Input and output of every pose method: observation, stated tolerances, and solution."""
+"""Input and output of every pose method: observation and its checks, stated tolerances, and solution."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
-from geometry.stereo import StereoRig
+from geometry.stereo import EYES, StereoRig
 
 
 @dataclass(frozen=True)
@@ -165,3 +166,125 @@ class NoFixReason:
 
 
 PoseMethod = Callable[[Observation], Solution | NoFixReason]
+
+
+# Three points determine a plane.
+_LEAST_PAIRS = 3
+# Points are collinear when their spread across a line is below this share of that along it: a tilt of 89 degrees.
+_COLLINEAR_FRACTION = 0.02
+# Measurements from elsewhere may lie outside the image, but by no more than its size.
+_OUTSIDE_IMAGES = 1.0
+# A ring tilted by 60 degrees appears a quarter smaller on average; the rest allows for noise at long range.
+_RIG_MISMATCH_FRACTION, _RIG_MISMATCH_PX = 0.35, 1.0
+
+
+def stereo_fault(observation: Observation) -> NoFixReason | None:
+    """Why no pose can be computed from the markers in both eyes; None when one can."""
+    for eye in range(2):
+        reason = _invalid_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
+        if reason is not None:
+            return reason
+    return _too_few_pairs(observation) or _degenerate_pairs(observation) or _rig_mismatch(observation)
+
+
+def hub_fault(observation: Observation) -> NoFixReason | None:
+    """Why the measured edges of the hub are invalid; None when they are valid."""
+    assert observation.hub_px is not None
+    assert observation.hub_cov_px2 is not None
+    for eye in range(2):
+        reason = _invalid_numbers(observation, observation.hub_px[eye], observation.hub_cov_px2[eye], eye, "hub edge")
+        if reason is not None:
+            return reason
+    return None
+
+
+def eye_fault(observation: Observation, eye: int, least: int) -> NoFixReason | None:
+    """Why no pose can be computed from the markers of one eye, 0 left or 1 right; None when one can."""
+    reason = _invalid_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
+    if reason is not None:
+        return reason
+    seen = observation.seen[eye]
+    if seen.sum() < least:
+        return NoFixReason(f"{int(seen.sum())} markers in the {EYES[eye]} eye, {least} are needed")
+    if _is_collinear(observation.layout.centers_m[seen, :2]) or _is_collinear(observation.pixels_px[eye, seen]):
+        return NoFixReason(f"the markers that the {EYES[eye]} eye sees lie on one line")
+    return None
+
+
+def _invalid_numbers(observation: Observation, pixels: Array, cov: Array, eye: int, what: str) -> NoFixReason | None:
+    size = np.array([observation.rig.camera.width_px, observation.rig.camera.height_px])
+    seen = ~np.isnan(pixels).any(axis=1)
+    outside = seen & ((pixels < -_OUTSIDE_IMAGES * size) | (pixels > (1 + _OUTSIDE_IMAGES) * size)).any(axis=1)
+    if outside.any():
+        index = int(np.argmax(outside))
+        x, y = pixels[index]
+        return NoFixReason(f"{what} {index} of the {EYES[eye]} eye lies far outside the image, at ({x:g}, {y:g}) px")
+    # Products of huge or infinite entries are nan, which fails the comparisons below.
+    with np.errstate(invalid="ignore", over="ignore"):
+        determinant = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] * cov[:, 1, 0]
+        sound = np.isfinite(cov).all(axis=(1, 2)) & (cov[:, 0, 0] > 0) & (determinant > 0) & np.isfinite(determinant)
+    if (seen & ~sound).any():
+        return NoFixReason(f"{what} {int(np.argmax(seen & ~sound))} of the {EYES[eye]} eye has no positive covariance")
+    return None
+
+
+def _too_few_pairs(observation: Observation) -> NoFixReason | None:
+    left, right = observation.seen.sum(axis=1)
+    if left == 0 or right == 0:
+        return NoFixReason("no markers in either eye" if left == right else "markers in one eye only")
+    pairs = int(observation.paired.sum())
+    if pairs < _LEAST_PAIRS:
+        return NoFixReason(f"{pairs} markers in both eyes, {_LEAST_PAIRS} are needed")
+    return None
+
+
+def _degenerate_pairs(observation: Observation) -> NoFixReason | None:
+    paired = observation.paired
+    for points in (observation.layout.centers_m[paired, :2], *observation.pixels_px[:, paired]):
+        if _is_collinear(points):
+            return NoFixReason("the markers that both eyes see lie on one line")
+    disparity_px = observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]
+    if disparity_px.min() <= 0:
+        return NoFixReason("a marker's disparity is not positive")
+    return None
+
+
+def _rig_mismatch(observation: Observation) -> NoFixReason | None:
+    """Whether disparities and the ring's size imply different distances, as with the wrong rig or drogue."""
+    paired = observation.paired
+    first, second = np.triu_indices(int(paired.sum()), 1)
+    places, pixels = observation.layout.centers_m[paired], observation.pixels_px[:, paired]
+    gaps_m, gaps_px = places[first] - places[second], pixels[:, first] - pixels[:, second]
+    # Medians, so that one or two outliers do not count.
+    px_per_m = np.sqrt((gaps_px**2).sum(axis=2) / (gaps_m**2).sum(axis=1))
+    expected_px = observation.rig.baseline_m * float(np.median(px_per_m))
+    disparity_px = float(np.median(pixels[0, :, 0] - pixels[1, :, 0]))
+
+    def fits(size_px: float) -> bool:
+        return abs(disparity_px - size_px) <= _RIG_MISMATCH_FRACTION * min(disparity_px, size_px) + _RIG_MISMATCH_PX
+
+    # Where only neighbouring markers of a tilted ring are seen, all gaps are foreshortened alike; the longest axis of
+    # the affine map from drogue to image is not.
+    if fits(expected_px) or fits(observation.rig.baseline_m * _largest_scale_px_per_m(observation)):
+        return None
+    return NoFixReason(
+        f"rig and drogue do not fit: markers this large have a disparity of {expected_px:.1f} px, "
+        f"these have {disparity_px:.1f} px"
+    )
+
+
+def _largest_scale_px_per_m(observation: Observation) -> float:
+    """Largest singular value of the affine map from the markers' plane to an image, mean of both eyes. [px/m]"""
+    paired = observation.paired
+    arms_m = observation.layout.centers_m[paired, :2]
+    arms_m = arms_m - arms_m.mean(axis=0)
+    maps = [np.linalg.lstsq(arms_m, px - px.mean(axis=0), rcond=None)[0] for px in observation.pixels_px[:, paired]]
+    return float(np.mean([np.linalg.svd(map_, compute_uv=False)[0] for map_ in maps]))
+
+
+def _is_collinear(points: Array) -> bool:
+    # The squared spreads along and across the line are the eigenvalues of the (2, 2) second moment, in closed form.
+    arms = points - points.sum(axis=0) / len(points)
+    (xx, xy), (_, yy) = (arms.T @ arms).tolist()
+    middle, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    return bool(middle - apart <= _COLLINEAR_FRACTION**2 * (middle + apart))

@@ -37,8 +37,7 @@ from nav.pose.marker_geometry import (
     rotations_from_axes,
     triangulate_markers,
 )
-from nav.pose.observation_checks import stereo_fault
-from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution, stereo_fault
 
 # Any three points lie on a circle, whatever their error.
 _LEAST_FOR_CIRCLE = 4

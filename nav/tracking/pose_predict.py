@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from nav.detector.detector import Detection
-from nav.matching.blobs import Blobs, disc_like_blobs
+from nav.matching.marker_channel import Blobs, disc_like_blobs
 from nav.tracking.box_motion import BoxMotion
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_center, box_size, expand_box, image_region, move_box
 

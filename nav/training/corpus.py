@@ -28,7 +28,7 @@ from datasets_manifest.storage.storage import Location
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
-from nav.training.geometric_augmentation import Boxes, Image
+from nav.training.augmentation import Boxes, Image
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text

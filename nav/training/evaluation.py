@@ -25,8 +25,8 @@ from datasets_manifest.storage.manifest import SplitName
 from geometry.boxes import intersection_over_union
 from nav.detector.input_image import PADDING_DN
 from nav.detector.multiscale_inference import detect_multiscale
+from nav.training.augmentation import Boxes, Image, paint_view, whole_view
 from nav.training.corpus import Corpus
-from nav.training.geometric_augmentation import Boxes, Image, paint_view, whole_view
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_settings import SizePx
 from nav.training.training_state import ComputeDevice

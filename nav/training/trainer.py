@@ -21,21 +21,23 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
 from nav.detector.network.head import DetectionLoss, detection_loss
-from nav.training.corpus import Corpus, EyeIndex
-from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
-from nav.training.geometric_augmentation import (
+from nav.training.augmentation import (
     TILES,
     Boxes,
     CanvasWindow,
     Image,
     ImageView,
     ViewRanges,
+    color_jitter,
+    cutout,
+    paint_distractors,
     paint_view,
     sample_mosaic,
     sample_view,
     whole_view,
 )
-from nav.training.photometric_augmentation import color_jitter, cutout, paint_distractors
+from nav.training.corpus import Corpus, EyeIndex
+from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurves, TrainingObserver, write_tables
 from nav.training.training_settings import SizePx, TrainingSettings

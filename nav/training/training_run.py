@@ -25,7 +25,6 @@ from nav.training.evaluation import (
     statistics_batches,
 )
 from nav.training.onnx_conversion import export_onnx, recalibrate_batch_norm
-from nav.training.starting_weights import StartingWeights, settings_from_start, starting_network
 from nav.training.trainer import Trainer
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import TrainingSettings
@@ -33,6 +32,7 @@ from nav.training.training_state import (
     BEST_FILE,
     ComputeDevice,
     MovingAverage,
+    StartingWeights,
     TrainingState,
     check_settings,
     limit_threads,
@@ -42,6 +42,8 @@ from nav.training.training_state import (
     open_compute_device,
     remove_partial_files,
     restore_state,
+    settings_from_start,
+    starting_network,
 )
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"

@@ -25,8 +25,8 @@ from scenes.atmosphere.air_layers import (
     ray_length_m,
     ray_steps,
     rayleigh_phase,
+    spectrum_of_rgb,
 )
-from scenes.atmosphere.spectrum import spectrum_of_rgb
 
 # Grid of heights [m] and of the sun's elevation [deg], closest where light changes most.
 _HEIGHTS_M = np.array([0, 250, 700, 1400, 2400, 3800, 6e3, 9e3, 13e3, 18e3, 24e3, 32e3, 43e3, 60e3, 85e3])

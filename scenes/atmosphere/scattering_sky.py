@@ -10,10 +10,17 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import Environment
 from scenes.air_light import LayeredAir, transmitted_share
-from scenes.atmosphere.air_layers import MOLECULES_AT_GROUND_PER_M, AirLayers, Array, horizon_dip_rad
+from scenes.atmosphere.air_layers import (
+    MOLECULE_DEPTH_550,
+    MOLECULES_AT_GROUND_PER_M,
+    RGB_WEIGHTS,
+    AirLayers,
+    Array,
+    horizon_dip_rad,
+    rgb_of_spectrum,
+)
 from scenes.atmosphere.multiple_scattering import scattered_light
 from scenes.atmosphere.sky_tables import Directions, SkyTables
-from scenes.atmosphere.spectrum import MOLECULE_DEPTH_550, RGB_WEIGHTS, rgb_of_spectrum
 from scenes.clouds.cloud_layers import BACK_SCATTER
 from scenes.sky.clear_sky import ClearSky, Luminary
 from scenes.sky.photometry import (

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from scenes.atmosphere.air_layers import (
     EARTH_M,
+    RGB_WEIGHTS,
     AirLayers,
     Array,
     aerosol_phase,
@@ -26,9 +27,9 @@ from scenes.atmosphere.air_layers import (
     ray_length_m,
     ray_steps,
     rayleigh_phase,
+    rgb_of_spectrum,
 )
 from scenes.atmosphere.multiple_scattering import scattered_light, source
-from scenes.atmosphere.spectrum import RGB_WEIGHTS, rgb_of_spectrum
 
 _ROWS, _COLUMNS, _SKY_STEPS = 40, 25, 40
 _DISTANCE_M = 1e3 * np.array(

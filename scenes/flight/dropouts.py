@@ -15,7 +15,7 @@ from drogue_models.obstacles import ObstacleShape
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.placement import rotation_with_z
+from scenes.framing import rotation_with_z
 
 # The bar is wider by this share, for the canopy behind the rim and for motion between the samples.
 _SPARE_FRACTION = 0.15

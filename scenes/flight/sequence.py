@@ -14,9 +14,8 @@ from datasets_manifest.recipe.drogue_ranges import PoseRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges
 from drogue_models.parameters import DrogueParameters
-from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
+from geometry.se3 import FRD_FROM_OPTICAL, Array, RigidTransform, exp_twist, log_twist
 from scenes.environment_sampling import sample_uniform
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.dropouts import (
@@ -26,11 +25,11 @@ from scenes.flight.dropouts import (
     sample_dropout,
     sun_beside_drogue_deg,
 )
-from scenes.flight.frame_kinematics import FrameKinematics
-from scenes.flight.hose_dynamics import HoseModel, drogue_rotation, still_mouth_direction
 from scenes.flight.suspension import WORLD_FROM_TANKER, hose_tail_m
+from scenes.flight.towed_hose import HoseModel, drogue_rotation, still_mouth_direction
 from scenes.flight.trajectory import (
     SETTLING_S,
+    FrameKinematics,
     SimulationInputs,
     Trajectory,
     desired_offsets_m,

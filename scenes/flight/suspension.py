@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.hose_ranges import HoseRanges
+from datasets_manifest.recipe.aircraft_ranges import HoseRanges
 from datasets_manifest.recipe.sequence_ranges import HoseParameters
 from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.parameters import DrogueParameters
-from drogue_models.surroundings.hose_look import HoseBand, HoseLook
+from drogue_models.surface_looks import HoseBand, HoseLook
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.flight.hose_statics import HOSE_LINKS, HoseEnds, hose_at_rest
+from scenes.flight.towed_hose import HOSE_LINKS, HoseEnds, hose_at_rest
 
 # World axes of a tanker that flies east: aft, right wing, up.
 WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])

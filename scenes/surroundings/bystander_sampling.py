@@ -14,8 +14,8 @@ from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from drogue_models.tankers.wing_with_pod import wing_surfaces
 from geometry.se3 import RigidTransform
 from geometry.stereo import StereoRig
-from scenes.flight.frame_kinematics import FrameKinematics
-from scenes.placement import rotation_with_z, sample_point_in_view
+from scenes.flight.trajectory import FrameKinematics
+from scenes.framing import rotation_with_z, sample_point_in_view
 from scenes.surroundings.distractor_sampling import BLACK_RUBBER, DistractorScene, sample_distractor
 from scenes.surroundings.receiver_sampling import receiver_of_scene
 

@@ -15,7 +15,7 @@ from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
-from scenes.placement import rotation_with_z_and_up, sample_point_in_view
+from scenes.framing import rotation_with_z_and_up, sample_point_in_view
 
 BLACK_RUBBER: ReflectanceRgb = (0.04, 0.04, 0.04)
 _ORANGE: ReflectanceRgb = (0.60, 0.16, 0.03)

@@ -7,19 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.hose_ranges import HoseRanges
-from datasets_manifest.recipe.neighbour_ranges import NeighbourRanges
+from datasets_manifest.recipe.aircraft_ranges import HoseRanges, NeighbourRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition
-from datasets_manifest.types.neighbours import OtherDrogue
+from datasets_manifest.types.frame import OtherDrogue
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tankers.tanker import Tanker
 from drogue_models.tankers.tanker_surfaces import airframe_size_m
 from drogue_models.tankers.wing_with_pod import pod_exit_m
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.flight.frame_kinematics import FrameKinematics
-from scenes.flight.hose_statics import HoseEnds, hose_at_rest
 from scenes.flight.suspension import (
     SceneHose,
     hose_look_of_scene,
@@ -27,7 +24,9 @@ from scenes.flight.suspension import (
     hose_tail_m,
     straight_hose_nodes_m,
 )
-from scenes.placement import sample_point_in_view
+from scenes.flight.towed_hose import HoseEnds, hose_at_rest
+from scenes.flight.trajectory import FrameKinematics
+from scenes.framing import sample_point_in_view
 
 _TRIES = 30
 # Own draws of the second hose in a scene come from a scene index that no other hose has.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.receiver_ranges import ReceiverRanges
+from datasets_manifest.recipe.aircraft_ranges import ReceiverRanges
 from datasets_manifest.types.appearance import Obstacle
 from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape, ProbeForm

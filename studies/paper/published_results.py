@@ -1,7 +1,7 @@
 """What the seed paper prints of its experiments, digit for digit; all of it is of data that are not public.
 
 Source: "Research of an Unmanned Aerial Vehicle Autonomous Aerial Refueling Docking Method Based on Binocular Vision"
-(docs/explanation/paper.md). Its table of detectors is in `droguekit.scoring.detection.detection_tables`.
+(docs/explanation/paper.md). Its table of detectors is in `droguekit.scoring.detection.detection_report`.
 """
 
 from __future__ import annotations

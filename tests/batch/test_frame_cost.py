@@ -12,7 +12,6 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
-from droguekit.batch.failure_policy import make_drop
 from droguekit.batch.frame_cost import (
     CostEstimate,
     ProbeResult,
@@ -22,7 +21,7 @@ from droguekit.batch.frame_cost import (
     make_in_turn,
     probe_cost,
 )
-from droguekit.batch.frame_task import FrameReport
+from droguekit.batch.frame_task import FrameReport, make_drop
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
 from droguekit.workflows.planning import cost_lines

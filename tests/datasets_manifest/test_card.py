@@ -14,8 +14,7 @@ import pytest
 import yaml
 
 from datasets_manifest.recipe.recipe import load_recipe
-from datasets_manifest.release.card import card_text, citation, write_card
-from datasets_manifest.release.croissant import describe_croissant, write_croissant
+from datasets_manifest.release.card import card_text, citation, describe_croissant, write_card, write_croissant
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECORD_FILE, frame_folder
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 

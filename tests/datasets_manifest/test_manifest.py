@@ -8,10 +8,17 @@ from typing import Any
 
 import pytest
 
-from datasets_manifest.storage import provenance
+from datasets_manifest.storage import manifest
 from datasets_manifest.storage.layout import frame_folder
-from datasets_manifest.storage.manifest import Drop, build_manifest, dataset_sha256, read_manifest, write_manifest
-from datasets_manifest.storage.provenance import cpu_features, software_versions
+from datasets_manifest.storage.manifest import (
+    Drop,
+    build_manifest,
+    cpu_features,
+    dataset_sha256,
+    read_manifest,
+    software_versions,
+    write_manifest,
+)
 
 SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(4)}
 
@@ -129,9 +136,9 @@ def test_processors_of_two_makers_are_two(tmp_path: Path, monkeypatch: pytest.Mo
     told = set()
     for maker in ("GenuineIntel", "AuthenticAMD"):
         (tmp_path / maker).write_text(f"processor\t: 0\nvendor_id\t: {maker}\nmodel name\t: any\n")
-        monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / maker)
+        monkeypatch.setattr(manifest, "_CPU_INFO", tmp_path / maker)
         told.add(frozenset(cpu_features()))
-    monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / "missing")
+    monkeypatch.setattr(manifest, "_CPU_INFO", tmp_path / "missing")
     nobody = frozenset(cpu_features())
     assert len(told | {nobody}) == 3 and frozenset.intersection(*told) == nobody
 
@@ -141,7 +148,7 @@ def test_two_models_of_one_maker_are_two_processors(tmp_path: Path, monkeypatch:
     for family, model in ((25, 17), (26, 17), (25, 1)):
         text = f"vendor_id\t: AuthenticAMD\ncpu family\t: {family}\nmodel\t\t: {model}\nmodel name\t: AMD EPYC\n"
         (tmp_path / "cpuinfo").write_text(text)
-        monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / "cpuinfo")
+        monkeypatch.setattr(manifest, "_CPU_INFO", tmp_path / "cpuinfo")
         features = cpu_features()
         assert f"family {family} model {model}" in features
         found.add(frozenset(features))

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from datasets_manifest.types.pixel_values import PixelValues, parse_pixel_values
+from datasets_manifest.types.images import PixelValues, parse_pixel_values
 
 VALUES = PixelValues(stamp_ns=1403636579763555584, encoding="gamma", black_level_dn=4.5, bits=12, exposure_s=0.002)
 

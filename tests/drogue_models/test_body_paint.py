@@ -9,7 +9,7 @@ from drogue_models.drogue_surfaces import drogue_surfaces
 from drogue_models.painted_mesh import texels_at
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_reflectance_rgb
 from drogue_models.presets import PRESETS, load_drogue, preset_names
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 
 FAMILIES = [name for name in preset_names() if name not in PRESETS]
 WEAR = SurfaceWear(seed=5)

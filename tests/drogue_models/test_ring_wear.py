@@ -11,7 +11,7 @@ from drogue_models.parameters import DrogueParameters, SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_reflectance_rgb
 from drogue_models.presets import PRESETS
 from drogue_models.solids import revolve
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 
 DROGUE = PRESETS["red-8"]
 WORN_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB)

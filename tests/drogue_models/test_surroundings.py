@@ -9,8 +9,8 @@ import trimesh
 from drogue_models.obstacles import COCKPIT_FORMS, DISTRACTOR_BODIES, PLAIN_FORMS, PROBE_FORMS, ObstacleShape
 from drogue_models.painted_mesh import HIGHEST_REFLECTANCE, LOWEST_REFLECTANCE, PaintedMesh
 from drogue_models.parameters import DrogueParameters, even_ring
-from drogue_models.surroundings.bystander_surface import bystander_surface
-from drogue_models.surroundings.hose_look import HoseBand, HoseLook
+from drogue_models.surface_looks import HoseBand, HoseLook
+from drogue_models.surroundings.bystanders import bystander_surface
 from drogue_models.surroundings.hose_surface import hose_surface
 
 GREY = (0.4, 0.41, 0.42)

@@ -26,8 +26,7 @@ from datasets_manifest.storage.writer import canonical_json
 from droguekit.batch.progress import PlainProgress
 from droguekit.visualization.browse.page import write_browse
 from droguekit.visualization.contact_sheet import write_contact_sheet
-from droguekit.visualization.rerun_viewer.recording import open_pairs
-from droguekit.visualization.rerun_viewer.session import view_pairs
+from droguekit.visualization.rerun_viewer import open_pairs, view_pairs
 from droguekit.workflows.benchmarking import benchmark_dataset
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry.body_axes import FLU_FROM_FRD, FRD_FROM_OPTICAL, NED_FROM_ENU
+from geometry.se3 import FLU_FROM_FRD, FRD_FROM_OPTICAL, NED_FROM_ENU
 
 
 def test_directions_keep_their_meaning() -> None:

@@ -15,7 +15,7 @@ from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye
 from labelgen.disc_images import DiscInEye, marker_discs
-from labelgen.export.annotations.mask_images import write_masks
+from labelgen.export.annotations.part_masks import write_masks
 from labelgen.export.export_log import ExportLog
 from labelgen.frame_labels import label_frame
 from labelgen.part_pixels import parts_mask

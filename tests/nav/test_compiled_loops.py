@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
-from nav.numerics import least_squares_loops
+from nav.numerics import levenberg_marquardt
 from nav.pose import adjustment_loops
 
 
@@ -17,7 +17,7 @@ def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile() ->
     code = """
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
-from nav.numerics import least_squares_loops
+from nav.numerics import levenberg_marquardt
 from nav.realtime import warm_up_jit
 from nav.pair_navigator import PairNavigator
 from nav.pose import adjustment_loops
@@ -26,7 +26,7 @@ from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, least_squares_loops, outline_pixels)
+    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -49,7 +49,7 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
 
 @pytest.mark.parametrize(
     "loops",
-    [adjustment_loops, blurred_edges, centroid_uncertainty, least_squares_loops, outline_pixels],
+    [adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels],
 )
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops: Any) -> None:
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]

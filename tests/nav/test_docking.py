@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import PoseEstimate
 from drogue_models.presets import load_drogue
-from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import RigidTransform
+from geometry.se3 import FRD_FROM_OPTICAL, RigidTransform
 from geometry.stereo import StereoRig
 from nav.docking import capture_radius_m, docking_quantities
 from nav.filtering.pose_filter import FilterState

@@ -12,7 +12,7 @@ from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, StereoRig
 from nav.centroids.disc_coverage import spread_discs
 from nav.centroids.small_centroids import small_centroids
-from nav.matching.blobs import Blobs
+from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import match_ring
 from nav.pair_navigator import correspond
 from nav.pose.joint import joint

@@ -13,7 +13,7 @@ from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
-from nav.matching.blobs import Blobs
+from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
 from nav.pair_navigator import correspond
 from nav.pose.pose_method import NoFixReason, Observation

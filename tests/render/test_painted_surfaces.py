@@ -15,7 +15,7 @@ from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import PaintedMesh, Sheen
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from drogue_models.surface_wear import SurfaceWear
+from drogue_models.surface_looks import SurfaceWear
 from geometry.se3 import RigidTransform
 from render.compositing import inside_one_part
 from render.engine import RenderEngine, load_engine

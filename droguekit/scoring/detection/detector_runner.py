@@ -14,7 +14,7 @@ from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.results.detection_result import DetectedBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
-from nav.pair_faults import PairFaults, fault_reason, unreadable_reason
+from nav.pair_measurement import PairFaults, fault_reason, unreadable_reason
 
 LEAST_SCORE = 0.001
 """Boxes with at least this score are kept: average precision needs low scores too."""

@@ -1,17 +1,25 @@
-"""Masks of the drogue and its features from part ids."""
+"""Masks of the drogue and its features from part ids, and their export as PNG images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.storage.image_codecs import encode_png
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import FeatureView, PixelBox, ViewRecord
 from drogue_models.parts import Part, marker_id
-from labelgen.part_pixels import FeaturePixels, drogue_mask
+from geometry.stereo import EYES
+from labelgen.export.export_log import ExportLog
+from labelgen.part_pixels import FeaturePixels, drogue_mask, parts_mask
+from labelgen.segmentation_masks import Mask, amodal_masks, named_parts, union_of_masks
 
 Indices = NDArray[np.int64]
 
@@ -118,3 +126,27 @@ class DroguePixels:
 
     def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
         return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
+
+
+def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
+    """Write `000123/left_rim_visible.png` and `left_rim_amodal.png`, 255 on the part and 0 elsewhere.
+
+    Empty masks have no file. Arguments and errors as in `labelgen.export.formats`.
+    """
+    source = Dataset(dataset)
+    with new_folder(out) as folder:
+        for record in log.records(source):
+            pair = folder / f"{record.frame_index:06d}"
+            pair.mkdir()
+            for eye in EYES:
+                part_id = source.part_ids(record.frame_index, eye)
+                alone = amodal_masks(record, eye, part_id)
+                for name, parts in named_parts(record).items():
+                    _write(pair / f"{eye}_{name}_visible.png", parts_mask(part_id, parts))
+                    _write(pair / f"{eye}_{name}_amodal.png", union_of_masks(alone, parts, part_id.shape))
+    return [out]
+
+
+def _write(path: Path, mask: Mask) -> None:
+    if mask.any():
+        path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), is_piecewise_constant=True))

@@ -25,12 +25,10 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.frame import Sensor
-from datasets_manifest.types.images import StereoImages
-from datasets_manifest.types.pixel_values import PIXEL_VALUES_TOPIC, PixelValues
+from datasets_manifest.types.images import PIXEL_VALUES_TOPIC, PixelValues, StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.presets import PRESETS
-from geometry.body_axes import FLU_FROM_FRD
-from geometry.se3 import RigidTransform
+from geometry.se3 import FLU_FROM_FRD, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from drogue_models.tankers.aircraft_paint import SCHEMES
 from drogue_models.tankers.atlas import ATLAS_HEIGHT_PX, ATLAS_WIDTH_PX, lay_out
-from drogue_models.tankers.paint_schemes import SCHEMES
 from drogue_models.tankers.planforms import airframe
 from drogue_models.tankers.tanker import STATIONS, PaintScheme, Tanker, TankerType
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces

@@ -19,7 +19,7 @@ from nav.centroids.binary_centroids import window_centroids
 from nav.pair_measurement import PairMeasurement, regions_of
 from nav.pair_navigator import DETECTOR, PairNavigator
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason
-from nav.tracking.rim_boxes import rim_boxes
+from nav.tracking.region import rim_boxes
 from tests.support.painted_pairs import FACE_RGB, background, expose, make_pose, paint_disc
 
 RIG = paper_rig()

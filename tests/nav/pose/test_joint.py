@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from geometry.circles import project_disc_centers
-from nav.pose.joint import joint, joint_hub
-from nav.pose.joint_batch import JointBatch, solve_joint_batch
+from nav.pose.joint import JointBatch, joint, joint_hub, solve_joint_batch
 from nav.pose.pose_method import EXACT, Solution, StatedTolerances
 from tests.support.painted_pairs import Draws, draw_poses, make_pose
 

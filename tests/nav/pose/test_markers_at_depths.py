@@ -12,7 +12,7 @@ from drogue_models.parameters import even_ring
 from drogue_models.presets import load_drogue
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from nav.matching.blobs import Blobs
+from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import match_ring
 from nav.pose.method_registry import METHODS
 from nav.pose.pose_method import NoFixReason, Observation, Solution

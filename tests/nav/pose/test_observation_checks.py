@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.pinhole import PinholeCamera
-from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.joint import solve_joint_batch
 from nav.pose.method_registry import METHODS
 from nav.pose.pose_method import NoFixReason, Observation, Solution, StatedTolerances
 from tests.support.painted_pairs import Draws, draw_poses

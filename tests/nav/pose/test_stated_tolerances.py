@@ -9,8 +9,7 @@ import pytest
 
 from nav.pose.adjustment import AdjustmentState, linearise
 from nav.pose.features import Features, stack_features, whiten, whiten_with_displacement
-from nav.pose.joint import joint_hub, joint_robust
-from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.joint import joint_hub, joint_robust, solve_joint_batch
 from nav.pose.method_registry import METHODS
 from nav.pose.pose_method import EXACT, StatedTolerances
 from tests.support.painted_pairs import Draws, draw_poses

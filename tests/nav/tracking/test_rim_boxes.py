@@ -10,7 +10,7 @@ import pytest
 from geometry.distortion import BrownConrady, Lens
 from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
-from nav.tracking.rim_boxes import rim_boxes
+from nav.tracking.region import rim_boxes
 
 RIG = paper_rig()
 CAMERA = RIG.camera

@@ -7,9 +7,7 @@ import torch
 
 from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import PADDING_DN, input_image, network_input
-from nav.training.corpus import CachedPair, Corpus, ImageCache
-from nav.training.evaluation import to_tensor, whole_image
-from nav.training.geometric_augmentation import (
+from nav.training.augmentation import (
     MIN_VISIBLE_FRACTION,
     CanvasWindow,
     ImageView,
@@ -22,6 +20,8 @@ from nav.training.geometric_augmentation import (
     warp_view,
     whole_view,
 )
+from nav.training.corpus import CachedPair, Corpus, ImageCache
+from nav.training.evaluation import to_tensor, whole_image
 from nav.training.training_state import ComputeDevice
 
 SOURCE_WH = (160, 120)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nav.training.photometric_augmentation import color_jitter, cutout, paint_distractors, paint_ring
+from nav.training.augmentation import color_jitter, cutout, paint_distractors, paint_ring
 
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
 

@@ -19,10 +19,9 @@ from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.onnx_conversion import export_onnx, import_onnx, recalibrate_batch_norm
-from nav.training.starting_weights import read_starting_weights
 from nav.training.training_run import check_training, train
 from nav.training.training_settings import build_settings
-from nav.training.training_state import save_checkpoint
+from nav.training.training_state import read_starting_weights, save_checkpoint
 
 NETWORKS = [NetworkConfig("l", "eca", "asff"), NetworkConfig("s", "se", "concat")]
 

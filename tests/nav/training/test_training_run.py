@@ -22,7 +22,6 @@ from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
 from nav.training.evaluation import average_precision, measure_batch_statistics, predict, to_tensor, whole_image
-from nav.training.starting_weights import read_starting_weights
 from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import (
@@ -34,6 +33,7 @@ from nav.training.training_state import (
     new_network,
     new_state,
     open_compute_device,
+    read_starting_weights,
     restore_state,
 )
 from tests.support.small_datasets import render_toy

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from droguekit.cli.main import WRONG_INPUT, run
-from droguekit.workflows.blender_environment import BPY_OF_PYTHON
+from droguekit.workflows.installation import BPY_OF_PYTHON
 from render.blender_engine import interpreter
 from render.blender_engine.interpreter import BlenderInterpreter, find_blender
 from render.blender_engine.messages import (
@@ -212,7 +212,7 @@ def test_an_installation_that_fails_leaves_the_old_environment(
 def test_without_a_fitting_python_doctor_says_which_are(
     bare: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("droguekit.workflows.blender_environment.sys.executable", str(bare / "none"))
+    monkeypatch.setattr("droguekit.workflows.installation.sys.executable", str(bare / "none"))
     assert run(["doctor", "--make-blender"]) == WRONG_INPUT
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("droguekit: error: doctor: Blender's package needs Python 3.13 or 3.11, and neither is here")

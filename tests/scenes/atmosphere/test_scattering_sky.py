@@ -7,10 +7,18 @@ import pytest
 
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.types.environment import CloudLayer, Environment
-from scenes.atmosphere.air_layers import AirLayers, aerosol_phase, height_along_m, horizon_dip_rad, ray_length_m
+from scenes.atmosphere.air_layers import (
+    MOLECULE_DEPTH,
+    RGB_WEIGHTS,
+    WAVELENGTH_UM,
+    AirLayers,
+    aerosol_phase,
+    height_along_m,
+    horizon_dip_rad,
+    ray_length_m,
+)
 from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
 from scenes.atmosphere.sky_tables import scattered_into_rays
-from scenes.atmosphere.spectrum import MOLECULE_DEPTH, RGB_WEIGHTS, WAVELENGTH_UM
 from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.ground_view import ground_view

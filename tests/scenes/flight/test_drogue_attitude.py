@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.flight.hose_dynamics import mouth_directions
+from scenes.flight.towed_hose import mouth_directions
 
 
 def test_the_drogue_points_with_a_lag_of_its_own() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.recipe.sequence_ranges import HOSES, Follower, HoseParameters
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
-from scenes.flight.hose_dynamics import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
+from scenes.flight.towed_hose import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
 from scenes.flight.trajectory import SimulationInputs, simulate
 
 FULL_SIZE = HOSES["full-size"]

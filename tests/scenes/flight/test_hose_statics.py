@@ -9,12 +9,13 @@ from datasets_manifest.recipe.sequence_ranges import HOSES, HoseParameters
 from datasets_manifest.types.field_types import Range
 from drogue_models.meshes import HOSE_SECTIONS, hose_mesh
 from geometry.se3 import Array
-from scenes.flight.hose_dynamics import GRAVITY_M_S2, HoseModel
-from scenes.flight.hose_statics import (
+from scenes.flight.towed_hose import (
     FITTED_LINKS,
+    GRAVITY_M_S2,
     HOSE_LINKS,
     HoseAtRest,
     HoseEnds,
+    HoseModel,
     bending_stiffness_n_m2,
     hose_at_rest,
     link_lengths_m,

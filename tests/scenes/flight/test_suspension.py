@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.hose_ranges import HoseRanges
+from datasets_manifest.recipe.aircraft_ranges import HoseRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import Array

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets_manifest.recipe.receiver_ranges import ReceiverRanges
+from datasets_manifest.recipe.aircraft_ranges import ReceiverRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.obstacles import DISTRACTOR_BODIES, PROBE_FORMS
-from drogue_models.surroundings.bystander_surface import bystander_surface
+from drogue_models.surroundings.bystanders import bystander_surface
 from geometry.se3 import Array
 from render.surfaces import frame_tanker_surfaces
 from scenes.sampler import sample_frame

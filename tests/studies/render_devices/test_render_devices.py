@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from drogue_models.parts import Part
-from studies.render_devices.__main__ import PairAgreement, RenderedPixels, agree, chosen_variant, compare_pair, main
+from studies.render_devices.__main__ import main
+from studies.render_devices.variant_comparison import PairAgreement, RenderedPixels, agree, chosen_variant, compare_pair
 from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 
 NOISE = 0.03

@@ -1,1 +1,0 @@
-"""Pairs, poses and errors as a recording of the rerun viewer."""
