@@ -1,7 +1,7 @@
 """One frame from the recipe to its files: the unit of work that a worker process repeats.
 
-`reproduce_frame` makes a frame of a dataset once more, and compares it with the stored one. `make_drop` takes an error that
-ends a single frame; others end the run, because other frames would fail too.
+`reproduce_frame` makes a frame of a dataset once more, and compares it with the stored one. `make_drop` takes an error
+that ends a single frame; others end the run, because other frames would fail too.
 """
 
 from __future__ import annotations
