@@ -39,10 +39,12 @@ def run_blocked(
     )
 
 
-def run_command_blocked(arguments: list[str], cwd: Path) -> None:
-    """Run the command line in such a process; it must succeed."""
-    code = "from droguekit.cli.main import run; sys.exit(run(sys.argv[1:]))"
-    result = run_blocked(code, arguments, cwd)
+def run_commands_blocked(commands: list[list[str]], cwd: Path) -> None:
+    """Run command lines one after the other in one such process; all must succeed."""
+    code = (
+        "from droguekit.cli.main import run; import json; sys.exit(any(run(each) for each in json.loads(sys.argv[1])))"
+    )
+    result = run_blocked(code, [json.dumps(commands)], cwd)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
@@ -81,11 +83,15 @@ def test_modules_import_without_what_is_blocked(
 
 
 def test_navigation_and_benchmark_run_without_renderer_meshes_and_torch(smoke_dataset: Path, tmp_path: Path) -> None:
-    run_command_blocked(
-        ["navigate", str(smoke_dataset), "--method", "paper", "--method", "joint", "--out", "estimates.jsonl"], tmp_path
-    )
     outputs = ["--json", "benchmark.json", "--html", "report.html"]
-    run_command_blocked(["benchmark", str(smoke_dataset), "--estimates", "estimates.jsonl", *outputs], tmp_path)
+    # One process: each would spend seconds on its imports.
+    run_commands_blocked(
+        [
+            ["navigate", str(smoke_dataset), "--method", "paper", "--method", "joint", "--out", "estimates.jsonl"],
+            ["benchmark", str(smoke_dataset), "--estimates", "estimates.jsonl", *outputs],
+        ],
+        tmp_path,
+    )
     result = json.loads((tmp_path / "benchmark.json").read_text(encoding="utf-8"))
     assert set(result["methods"]) == {"paper", "joint"}
     assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8").lower()
