@@ -31,7 +31,7 @@ from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.parameters import BodyMesh, DrogueParameters
 from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, pocketed_plate, revolve
-from drogue_models.untrusted_files import read_regular
+from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.se3 import Array
 
 # Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
@@ -75,9 +75,10 @@ def _parse_body_mesh(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
     if file_type not in readable:
         raise ValueError(f"body_mesh: {name} is of a kind that cannot be read; use one of {', '.join(readable)}")
     try:
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False)
+        with limited_memory(len(data)):
+            mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False)
     except Exception as error:  # each of trimesh's readers fails in its own way
-        raise ValueError(f"body_mesh: {name} cannot be read as {file_type}: {error}") from error
+        raise ValueError(f"body_mesh: {name} cannot be read as {file_type}: {' '.join(str(error).split())}") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"body_mesh: {name} holds no triangles; export one mesh of triangles")
     return mesh

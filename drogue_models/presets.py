@@ -10,7 +10,7 @@ import math
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -19,6 +19,9 @@ from drogue_models.parameters import WHITE_PAINT, DrogueParameters, HubParameter
 from drogue_models.parts import MAX_MARKERS
 from drogue_models.untrusted_files import parse_toml, read_regular, read_text
 
+MOST_FAULTS = 20
+"""Most faults of a failed validation that a message names."""
+_MOST_CHARACTERS = 200
 # The largest even ring that leaves 10 mm of dark face around markers of 0.10 m inside a rim of 0.33 m.
 RING_RADIUS_M = 0.27
 
@@ -124,6 +127,10 @@ class MarkerRing(FrozenModel):
     turn_deg: float = 0.0
 
 
+# A ring has at least one marker.
+_RINGS = TypeAdapter(Annotated[tuple[MarkerRing, ...], Field(max_length=MAX_MARKERS)])
+
+
 def _expand_rings(table: dict[str, Any]) -> None:
     """Replace a list of rings by positions and depths, in place."""
     if "marker_rings" not in table:
@@ -131,7 +138,7 @@ def _expand_rings(table: dict[str, Any]) -> None:
     for key in ("marker_positions_m", "marker_depths_m"):
         if key in table:
             raise ValueError(f"{key}: leave it out, or leave out marker_rings or marker_count")
-    rings = TypeAdapter(tuple[MarkerRing, ...]).validate_python(table.pop("marker_rings"))
+    rings = _RINGS.validate_python(table.pop("marker_rings"))
     positions: list[PlanePoint] = []
     for ring in rings:
         turn = complex(math.cos(math.radians(ring.turn_deg)), math.sin(math.radians(ring.turn_deg)))
@@ -172,12 +179,17 @@ def _pin_body_mesh(table: dict[str, Any], folder: Path) -> None:
 
 
 def explain(error: ValidationError) -> str:
-    """All faults of a failed validation on one line, each with its key."""
+    """The faults of a failed validation on one line, each with its key; of very many the first ones."""
     faults = []
-    for fault in error.errors(include_url=False):
-        where = ".".join(str(part) for part in fault["loc"])
+    for fault in error.errors(include_url=False)[:MOST_FAULTS]:
+        where = ".".join(_shortened(str(part)) for part in fault["loc"])
         message = fault["msg"].removeprefix("Value error, ")
         value = fault["input"]
-        got = f", got {value!r}" if isinstance(value, str | int | float | bool) else ""
+        got = f", got {_shortened(repr(value))}" if isinstance(value, str | int | float | bool) else ""
         faults.append(f"{where}: {message}{got}" if where else f"{message}")
-    return "; ".join(faults)
+    more = error.error_count() - MOST_FAULTS
+    return "; ".join(faults) + (f"; and {more} more faults" if more > 0 else "")
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MOST_CHARACTERS else f"{text[:_MOST_CHARACTERS]}..."

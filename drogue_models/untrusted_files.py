@@ -1,7 +1,7 @@
 """Reads files that may come from anybody: regular ones only, up to a size, with JSON and TOML up to a depth.
 
-A pipe would wait for ever, a device such as /dev/zero has no end, and a megabyte of brackets overflows the stack of a
-parser that calls itself.
+A pipe would wait for ever, a device such as /dev/zero has no end, a megabyte of brackets overflows the stack of a
+parser that calls itself, and a megabyte of zeros holds gigabytes once it is expanded.
 """
 
 from __future__ import annotations
@@ -10,8 +10,12 @@ import errno
 import json
 import os
 import re
+import resource
 import stat
+import threading
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -26,7 +30,11 @@ MOST_NESTING = 100
 MOST_DIGITS = 300
 """Most digits of a whole number in JSON and TOML: larger ones are no float."""
 
+MOST_MEMORY_BYTES, MEMORY_BYTES_PER_BYTE = 2**30, 64
+"""Most memory that a library may take to read a file: the first number, and so much more for each byte of the file."""
+
 _BLOCK_BYTES = 2**20
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 # What does not matter for the nesting of TOML: texts and comments. A text that does not end reaches to the end.
 _TOML_TEXTS = re.compile(
     r'"""(?:[^\\"]|\\.|"(?!""))*+(?:"{3,5}|\Z)'
@@ -159,3 +167,60 @@ def _whole_number(text: str) -> int:
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"holds {name}, which is no number of JSON")
+
+
+class _MemoryLimit:
+    """The limit of this process while blocks of `limited_memory` run, in any of its threads."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.blocks = 0
+        self.before = self.now = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+
+
+_LIMIT = _MemoryLimit()
+
+
+@contextmanager
+def limited_memory(file_bytes: int) -> Iterator[None]:
+    """Let the process take a bounded amount of memory more than it holds, for a library that trusts a file's numbers.
+
+    The limit is that of the whole process: what other threads take meanwhile counts too, so it is a wide one.
+
+    Args:
+        file_bytes: size of the file; see `MOST_MEMORY_BYTES`.
+
+    Raises:
+        ValueError: the library asked for more, and said so by a `MemoryError`; most raise an error of their own.
+    """
+    more = MOST_MEMORY_BYTES + MEMORY_BYTES_PER_BYTE * file_bytes
+    with _LIMIT.lock:
+        if _LIMIT.blocks == 0:
+            _LIMIT.before = _LIMIT.now = resource.getrlimit(resource.RLIMIT_DATA)
+        _LIMIT.blocks += 1
+        _raise_limit(_data_bytes() + more, is_first=_LIMIT.blocks == 1)
+    try:
+        yield
+    except MemoryError as error:
+        raise ValueError(f"takes more than {more} bytes of memory, too much for a file of {file_bytes}") from error
+    finally:
+        with _LIMIT.lock:
+            _LIMIT.blocks -= 1
+            if _LIMIT.blocks == 0:
+                resource.setrlimit(resource.RLIMIT_DATA, _LIMIT.before)
+
+
+def _raise_limit(most_bytes: int, is_first: bool) -> None:
+    """Set the limit of a first block; a further one may only raise it, and none beyond what holds outside."""
+    soft, hard = _LIMIT.now
+    if not is_first:
+        most_bytes = max(most_bytes, soft)
+    outside = _LIMIT.before[0]
+    if outside == resource.RLIM_INFINITY or most_bytes < outside:
+        _LIMIT.now = (most_bytes, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, _LIMIT.now)
+
+
+def _data_bytes() -> int:
+    """Memory of this process that counts for the limit."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * _PAGE_BYTES

@@ -1,4 +1,4 @@
-"""Checks the compressed chunks of a ROS bag before its reader takes them: their sizes, and their checksums if any.
+"""Checks the files of a ROS bag before its reader takes them: sizes, compressed chunks, and checksums if any.
 
 A megabyte of bzip2 can hold many gigabytes, and flipped bits of a picture look like a picture.
 """
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 
-from drogue_models.untrusted_files import open_regular
+from drogue_models.untrusted_files import open_regular, read_text
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -24,25 +24,34 @@ else:
 
 MOST_CHUNK_BYTES = 2**28
 """Most bytes of a chunk; recorders begin a new one after some megabytes, or after one message."""
+MOST_EXPANSION = 100
+"""A file that is compressed as a whole may expand to the size of a chunk, and to so many times its own size."""
+_CONTENTS_FILE = "metadata.yaml"
 _BLOCK_BYTES = 2**20
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
     "bz2": bz2.BZ2Decompressor,
     "lz4": lz4.frame.LZ4FrameDecompressor,
     "zstd": zstd.ZstdDecompressor,
 }
-_MCAP_MAGIC, _ROS1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
+_MCAP_MAGIC, _ROS1_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"\x28\xb5\x2f\xfd"
 _MCAP_CHUNK, _MCAP_DATA_END, _ROS1_CHUNK = 0x06, 0x0F, 0x05
 
 
-def check_chunks(bag: Path) -> None:
-    """Check the chunks of a bag's files; files of other kinds are left to their reader.
+def check_bag(bag: Path) -> int:
+    """Check a bag's files: their chunks, what a compressed one expands to, and the size of the table of contents.
+
+    Returns:
+        Size of all files. [bytes]
 
     Raises:
         ValueError: a chunk is too large or not as large as it says, or a checksum is wrong; names the file.
         OSError: a file cannot be read.
     """
-    files = sorted(path for path in bag.iterdir() if path.suffix == ".mcap") if bag.is_dir() else [bag]
+    files = sorted(path for path in bag.iterdir() if path.is_file()) if bag.is_dir() else [bag]
     for path in files:
+        if path.name == _CONTENTS_FILE:
+            read_text(path)
+            continue
         with open_regular(path) as stream:
             magic = stream.read(len(_ROS1_MAGIC))
             try:
@@ -51,10 +60,28 @@ def check_chunks(bag: Path) -> None:
                 elif magic.startswith(_MCAP_MAGIC):
                     stream.seek(0)
                     _check_mcap(stream)
+                elif magic.startswith(_ZSTD_MAGIC):
+                    stream.seek(0)
+                    _check_expansion(stream, path.stat().st_size)
             except (struct.error, EOFError, UnicodeDecodeError) as error:
                 raise ValueError(f"{path}: is truncated or damaged") from error
             except ValueError as error:
                 raise ValueError(f"{path}: is damaged: {error}") from error
+    return sum(path.stat().st_size for path in files)
+
+
+def _check_expansion(stream: BinaryIO, file_bytes: int) -> None:
+    """Refuse a compressed file that would fill the disk, as the reader expands it there."""
+    most_bytes = MOST_CHUNK_BYTES + MOST_EXPANSION * file_bytes
+    found = 0
+    try:
+        with zstd.open(stream, "rb") as expanded:
+            while block := expanded.read(_BLOCK_BYTES):
+                found += len(block)
+                if found > most_bytes:
+                    raise ValueError(f"expands to more than {most_bytes} bytes")
+    except zstd.ZstdError as error:
+        raise ValueError(f"cannot be decompressed: {error}") from error
 
 
 def _check_mcap(stream: BinaryIO) -> None:

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 
 from datasets_manifest.storage.image_codecs import check_image_size
 from datasets_manifest.types.images import Pixels
-from drogue_models.untrusted_files import read_regular
+from drogue_models.untrusted_files import limited_memory, read_regular
 
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 
@@ -59,8 +59,9 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
     _check_size(data, name)
     orientation = _orientation(data, name)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
-    except cv2.error as error:
+        with limited_memory(data.size):
+            image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+    except (cv2.error, ValueError) as error:
         raise ValueError(f"{name}: cannot be read: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{name}: is truncated, or not an image of 8 or 16 bits")

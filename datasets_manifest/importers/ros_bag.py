@@ -14,11 +14,12 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
-from datasets_manifest.importers.bag_chunks import check_chunks
+from datasets_manifest.importers.bag_chunks import check_bag
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.ros_images import RosImage, decode_image, message_stamp_ns
 from datasets_manifest.importers.stamp_pairs import match_stamps, smallest_difference_ns
 from datasets_manifest.types.images import PIXEL_VALUES_TOPIC, PixelValues, parse_pixel_values
+from drogue_models.untrusted_files import limited_memory
 from geometry.se3 import Array
 from geometry.stereo import EYES, StereoRig
 
@@ -64,7 +65,7 @@ class RosBag:
         """
         self._path = path
         try:
-            check_chunks(path)
+            self._file_bytes = check_bag(path)
         except OSError as error:
             raise ValueError(f"{path}: cannot be read as a ROS bag: {error.strerror}") from error
         with self._open() as reader:
@@ -73,7 +74,7 @@ class RosBag:
                 if not any(c.topic == topic and c.msgtype in _IMAGE_TYPES for c in reader.connections):
                     raise ValueError(f"{path}: has no images on {topic}; there are {_topics_of(reader, _IMAGE_TYPES)}")
             stamps: dict[str, set[int]] = {topic: set() for topic in self._topics}
-            for connection, _, message in _messages(reader, self._topics, path):
+            for connection, message in self._messages(reader, self._topics):
                 stamp_ns = message_stamp_ns(message)
                 if stamp_ns in stamps[connection.topic]:
                     raise ValueError(
@@ -106,7 +107,7 @@ class RosBag:
         waiting: dict[int, dict[int, Any]] = {}
         due = 0
         with self._open() as reader:
-            for connection, _, message in _messages(reader, self._topics, self._path):
+            for connection, message in self._messages(reader, self._topics):
                 eye = self._topics.index(connection.topic)
                 place = places[eye].get(message_stamp_ns(message))
                 if place is None:
@@ -156,7 +157,7 @@ class RosBag:
             topics = f"{bases[0]}/camera_info", f"{bases[1]}/camera_info"
         found: dict[str, Any] = {}
         with self._open() as reader:
-            for connection, _, message in _messages(reader, topics, self._path):
+            for connection, message in self._messages(reader, topics):
                 if connection.msgtype != _INFO_TYPE:
                     continue
                 first = found.setdefault(connection.topic, message)
@@ -184,7 +185,7 @@ class RosBag:
         if len(topics) > 1:
             raise ValueError(f"{self._path}: has several rigs' pixel values, on {' and '.join(sorted(topics))}")
         found: dict[int, PixelValues] = {}
-        for connection, _, message in _messages(reader, tuple(topics), self._path):
+        for connection, message in self._messages(reader, tuple(topics)):
             try:
                 values = parse_pixel_values(str(message.data))
             except ValueError as error:
@@ -192,11 +193,29 @@ class RosBag:
             found[values.stamp_ns] = values
         return found or None
 
+    def _messages(self, reader: AnyReader, topics: tuple[str, ...]) -> Iterator[tuple[Connection, Any]]:
+        """Decoded messages of some topics; errors of the reader on damaged bags become a ValueError of one line."""
+        connections = [connection for connection in reader.connections if connection.topic in topics]
+        messages = reader.messages(connections=connections) if connections else iter(())
+        while True:
+            try:
+                # Whoever takes a message takes memory of its own.
+                with limited_memory(self._file_bytes):
+                    found = next(messages, None)
+                    message = None if found is None else reader.deserialize(found[2], found[0].msgtype)
+            except Exception as error:
+                reason = " ".join(str(error).split())
+                raise ValueError(f"{self._path}: is damaged: {type(error).__name__}: {reason}") from error
+            if found is None:
+                return
+            yield found[0], message
+
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:
         try:
-            reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            reader.open()
+            with limited_memory(self._file_bytes):
+                reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+                reader.open()
         except Exception as error:  # whatever a damaged bag makes its reader raise
             message = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(f"{self._path}: cannot be read as a ROS bag: {message}") from error
@@ -204,20 +223,6 @@ class RosBag:
             yield reader
         finally:
             reader.close()
-
-
-def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterator[tuple[Connection, int, Any]]:
-    """Decoded messages of some topics; errors of the reader on damaged bags become a ValueError of one line."""
-    connections = [connection for connection in reader.connections if connection.topic in topics]
-    if not connections:
-        return
-    try:
-        for connection, time_ns, data in reader.messages(connections=connections):
-            yield connection, time_ns, reader.deserialize(data, connection.msgtype)
-    except GeneratorExit:
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: is damaged: {type(error).__name__}: {' '.join(str(error).split())}") from error
 
 
 def _topics_of(reader: AnyReader, types: tuple[str, ...]) -> str:

@@ -5,7 +5,6 @@ The shipped rigs have the seed paper's geometry with three sensors, and ideal or
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -17,6 +16,7 @@ from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import Optics, Sensor
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
+from drogue_models.untrusted_files import parse_toml, read_text
 from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import exp_twist
@@ -110,9 +110,9 @@ def read_rig_file(text: str, where: str) -> dict[str, Any]:
         ValueError: not TOML, or no preset to start from.
     """
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{where}: not valid TOML: {error}") from error
+        table = parse_toml(text)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
     if "preset" not in table:
         raise ValueError(f"{where}: preset: name the shipped rig to start from; there are {', '.join(SENSORS)}")
     return table
@@ -132,9 +132,12 @@ def load_rig(value: object, base: Path | None = None) -> object:
         return value
     path = (base or Path()) / value
     try:
-        return read_rig_file(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
+        text = read_text(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}") from error
+    return read_rig_file(text, str(path))
 
 
 def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:

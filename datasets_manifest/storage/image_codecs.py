@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.types.images import Pixels
+from drogue_models.untrusted_files import limited_memory
 from geometry.pinhole import PinholeCamera
 
 MOST_PIXELS = 150_000_000
@@ -200,7 +201,7 @@ def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
     check_image_size(right - left + 1, bottom - top + 1, _EXR_SAMPLE_BYTES * header.channel_count, len(data))
     try:
         # The library reads files only.
-        with scratch_folder() as folder:
+        with scratch_folder() as folder, limited_memory(len(data)):
             copy = folder / "image.exr"
             copy.write_bytes(data)
             with OpenEXR.File(str(copy), separate_channels=True) as file:

@@ -79,7 +79,10 @@ class RemoteStorage:
                 return []
         # Some stores list an empty object for the folder itself.
         own = self._path(folder).strip("/")
-        return sorted({PurePosixPath(entry).name for entry in entries if entry.strip("/") != own})
+        below = (
+            entry.removeprefix(f"{self._path(folder)}/").rstrip("/") for entry in entries if entry.strip("/") != own
+        )
+        return sorted({name for name in below if _is_plain_key(name)})
 
     def files_ending(self, suffix: str) -> list[str]:
         """All objects with the suffix, at any depth."""
@@ -188,7 +191,9 @@ class RemoteStorage:
                 found = self._fs.find(self._path(folder))
             except FileNotFoundError:
                 return []
-        return sorted(path.removeprefix(f"{self._root}/") for path in found)
+        prefix = f"{self._root}/"
+        names = (path.removeprefix(prefix) for path in found if path.startswith(prefix))
+        return sorted(filter(_is_plain_key, names))
 
     def _is_of_object(self, error: FileNotFoundError, name: str) -> bool:
         """Whether the error says that the object is missing, which may be expected, and not its bucket."""
@@ -207,6 +212,15 @@ class RemoteStorage:
             if isinstance(error, FileNotFoundError):
                 number = errno.EIO
             raise OSError(number, f"{self.where(name)}: cannot be {what}: {reason}") from error
+
+
+def _is_plain_key(name: str) -> bool:
+    """Whether a request for an object reaches that object; others in a store are never ours, and left alone.
+
+    A store may hold keys with `..`, which clients of HTTP join: to delete `frames/x/../../manifest.json` would delete
+    the manifest.
+    """
+    return name.isprintable() and not any(part in ("", ".", "..") for part in name.split("/"))
 
 
 class _ObjectStream(io.RawIOBase):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from datasets_manifest.types.images import StereoImages
-from drogue_models.untrusted_files import read_regular
+from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
@@ -59,7 +59,7 @@ class OnnxDetector:
             raise ValueError(f"threads: must be at least 1, got {threads}")
         self.name = name or file.stem
         self._file = file
-        self._session = _open_session(file, threads)
+        self._session, self._file_bytes = _open_session(file, threads)
         self._input_name, fixed_size = _checked_input(file, self._session)
         self.metadata = _read_metadata(file, self._session, fixed_size)
         self.input_size_px = input_size_px or fixed_size or self.metadata.input_size_px
@@ -107,8 +107,9 @@ class OnnxDetector:
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:
-            return _run_until_interrupt(self._session, {self._input_name: batch})
-        except _ORT_ERRORS as error:
+            with limited_memory(self._file_bytes + batch.nbytes):
+                return _run_until_interrupt(self._session, {self._input_name: batch})
+        except (*_ORT_ERRORS, ValueError) as error:
             raise ValueError(f"{self._file}: does not run on {batch.shape}: {_first_line(error)}") from error
 
     def _check_maps(self, maps: list[NDArray[Any]], size_px: tuple[int, int]) -> None:
@@ -120,7 +121,8 @@ class OnnxDetector:
             )
 
 
-def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
+def _open_session(file: Path, threads: int) -> tuple[onnxruntime.InferenceSession, int]:
+    """The network, and the size of its file. [bytes]"""
     try:
         content = read_regular(file)
     except OSError as error:
@@ -134,9 +136,12 @@ def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     # No folder: a network from memory would take weights from files below the working directory.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except _ORT_ERRORS as error:
+        # It computes what is constant in a network, which may be of any size.
+        with limited_memory(len(content)):
+            session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except (*_ORT_ERRORS, ValueError) as error:
         raise ValueError(f"{file}: is truncated or not an ONNX network: {_first_line(error)}") from error
+    return session, len(content)
 
 
 def _run_until_interrupt(

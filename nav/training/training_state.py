@@ -8,6 +8,7 @@ import io
 import math
 import os
 import pickle
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from datasets_manifest.atomic import PART_SUFFIX, open_bytes_atomic
-from drogue_models.untrusted_files import read_regular
+from drogue_models.untrusted_files import limited_memory, read_regular
 from nav.detector.detector_registry import network_file
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.corpus import DatasetStamp
@@ -28,6 +29,10 @@ from nav.training.training_progress import EpochRow
 from nav.training.training_settings import TrainingSettings, differing_settings
 
 CHECKPOINT_FILE, BEST_FILE = "checkpoint.pt", "best.pt"
+_LOAD_ERRORS = (
+    zipfile.BadZipFile, RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError,
+    TypeError, IndexError,
+)  # fmt: skip
 _VERSION = 1  # incremented with every change of a checkpoint's contents
 # After n steps the average spans about the last n/10 of them, until the decay of the settings is reached.
 _RAMP_STEPS = 10
@@ -63,9 +68,14 @@ def load_checkpoint(path: Path, advice: str = "delete it, or train into another 
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     try:
+        # torch stores without compression; a compressed megabyte could hold gigabytes.
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise ValueError("is compressed")
         # Only tensors and plain values are accepted, so that a file cannot run code.
-        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
+        with limited_memory(len(content)):
+            state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except _LOAD_ERRORS as error:
         raise ValueError(f"{path}: is truncated or not a checkpoint; {advice}") from error
     if not isinstance(state, dict):
         raise ValueError(f"{path}: is not a checkpoint; {advice}")

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from moto.backends import get_backend
+from moto.core import DEFAULT_ACCOUNT_ID
 from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
@@ -149,6 +151,41 @@ def test_images_and_records_are_those_on_disk(packed: str, local: Path) -> None:
         assert encode_record(there.record(index)) == encode_record(here.record(index))
         assert (there.images(index).right == here.images(index).right).all()
         assert (there.part_ids(index, "left") == here.part_ids(index, "left")).all()
+
+
+# Keys that a store can hold and that no run of ours writes, below a dataset.
+HOSTILE_KEYS = [
+    "frames/../../../../etc/passwd", "frames/../record.json", "frames//record.json", "frames/./record.json",
+    "frames/000009/../../manifest.json", "frames/a/../../../other/manifest.json", "annotations/../../evil.json",
+    "frames/000001\x1b[2J/record.json", "frames/a\nb/x.png", "x\r\n.json", ".hidden.json", "frames/-00001/record.json",
+    "frames/\u0660\u0660\u0660\u0660\u0660\u0669/record.json", "frames/999999999999999999999/record.json",
+    "shards/\u0663.tar", "shards/000000.tar/x",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("stray", [0, pytest.param(2500, marks=pytest.mark.slow)])
+def test_a_hostile_listing_changes_nothing(
+    stray: int, place: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sha256 = render_recipe(place, range(3), 0, text).dataset_sha256
+    backend = get_backend("s3")[DEFAULT_ACCOUNT_ID]["aws"]
+    root = place.removeprefix(f"s3://{BUCKET}/")
+    for key in (*HOSTILE_KEYS, *(f"frames/{number:030d}/record.json" for number in range(stray))):
+        backend.put_object(BUCKET, f"{root}/{key}", b"{}")
+    for key in ("frames/000004/left.png", "../other/manifest.json"):
+        backend.put_object(BUCKET, f"{root}/{key}".replace(f"{root}/../", ""), b"half")
+    before = {*backend.buckets[BUCKET].keys}
+    assert list_frames(place) == [0, 1, 2]
+    assert validate_dataset(place).faults == [f"{place}/frames/000004/left.png: was left by a run that was killed"]
+    assert render_recipe(place, range(3), 0, text).dataset_sha256 == sha256
+    # What a killed run leaves is removed, and nothing else.
+    assert before - {*backend.buckets[BUCKET].keys} == {f"{root}/frames/000004/left.png"}
+    out = tmp_path / "out"
+    assert run(["validate", place]) == DONE
+    assert run(["export", place, "--format", "webdataset", "--out", str(out / "webdataset")]) == DONE
+    told = capsys.readouterr()
+    assert "".join(each for each in told.out + told.err if not each.isprintable()).strip("\n") == ""
+    assert [*tmp_path.iterdir()] == [out]
 
 
 def test_a_changed_tar_file_is_found(text: str, place: str) -> None:

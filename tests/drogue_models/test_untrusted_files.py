@@ -2,14 +2,25 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import subprocess
+import sys
+import threading
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from datasets_manifest.recipe.recipe import load_recipe, recipe_names
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import HubParameters
+from drogue_models.presets import MOST_FAULTS, explain
 from drogue_models.untrusted_files import (
+    MOST_MEMORY_BYTES,
     MOST_NESTING,
+    limited_memory,
     open_regular,
     parse_json,
     parse_toml,
@@ -130,3 +141,72 @@ def test_toml_is_read_as_by_the_library() -> None:
 def test_toml_that_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_toml(text)
+
+
+def test_a_library_gets_so_much_more_memory_and_no_more() -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with limited_memory(0):
+        assert np.empty(MOST_MEMORY_BYTES // 2, np.uint8).size
+    with (
+        pytest.raises(ValueError, match=f"takes more than {MOST_MEMORY_BYTES + 64000} bytes of memory"),
+        limited_memory(1000),
+    ):
+        np.empty(MOST_MEMORY_BYTES + 2**26, np.uint8)
+    with limited_memory(2**25):
+        assert np.empty(MOST_MEMORY_BYTES + 2**26, np.uint8).size
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+def test_blocks_of_several_threads_share_the_widest_limit() -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    is_open, may_end = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with limited_memory(2**25):
+            is_open.set()
+            may_end.wait(60)
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    assert is_open.wait(60)
+    with limited_memory(0):
+        assert np.empty(MOST_MEMORY_BYTES + 2**26, np.uint8).size
+        may_end.set()
+        thread.join()
+        # The limit stays until the last block ends.
+        assert resource.getrlimit(resource.RLIMIT_DATA) != before
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+def test_a_tighter_limit_from_outside_stays() -> None:
+    code = (
+        "import resource\nfrom drogue_models.untrusted_files import limited_memory\n"
+        "most = 2**30 // 2\nresource.setrlimit(resource.RLIMIT_DATA, (most, resource.RLIM_INFINITY))\n"
+        "with limited_memory(0):\n    assert resource.getrlimit(resource.RLIMIT_DATA)[0] == most\n"
+        "assert resource.getrlimit(resource.RLIMIT_DATA)[0] == most"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_list_of_wrong_items_is_told_by_its_first_one() -> None:
+    class Item(FrozenModel):
+        one: int
+        two: int
+
+    class Table(FrozenModel):
+        items: tuple[Item, ...]
+        pair: tuple[float, float]
+
+    with pytest.raises(ValidationError) as caught:
+        Table.model_validate({"items": [{}] * 1000, "pair": ["a", "b"]})
+    assert explain(caught.value).count("Field required") == 2
+    # Of a fixed number of places each is told.
+    assert [fault["loc"] for fault in caught.value.errors()][2:] == [("pair", 0), ("pair", 1)]
+
+
+def test_of_many_faults_the_first_ones_are_told() -> None:
+    with pytest.raises(ValidationError) as caught:
+        HubParameters.model_validate({f"key{number}" + "x" * 5000: "y" * 5000 for number in range(1000)})
+    told = explain(caught.value)
+    assert told.endswith(f"; and {1000 - MOST_FAULTS} more faults")
+    assert told.count("key") == MOST_FAULTS and len(told) < MOST_FAULTS * 600

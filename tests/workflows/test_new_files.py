@@ -61,3 +61,15 @@ def test_a_rig_file_without_a_preset_is_told(tmp_path: Path, capsys: pytest.Capt
     (tmp_path / "rig.toml").write_text("width_px = 640\n")
     assert run(["new", "recipe", "--rig", "rig.toml", "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
     assert "rig.toml: preset: name the shipped rig to start from" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text", ["a = " + "[" * 10_000, "a." * 10_000 + "a = 1", "a = " + "1" * 5000, "# " + "x" * 2**20]
+)
+def test_a_hostile_rig_file_is_told(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.toml").write_text(text)
+    assert (
+        run(["new", "recipe", "--rig", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+    )
+    told = capsys.readouterr().err
+    assert "rig.toml: " in told and told.count("\n") == 1

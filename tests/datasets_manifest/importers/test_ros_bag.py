@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import io
 import json
+import sqlite3
 import struct
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import pytest
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 
-from datasets_manifest.importers.bag_chunks import check_chunks, zstd
+from datasets_manifest.importers import bag_chunks
+from datasets_manifest.importers.bag_chunks import check_bag, zstd
 from datasets_manifest.importers.ros_bag import RosBag
 from datasets_manifest.importers.ros_images import decode_image
+from drogue_models import untrusted_files
 from tests.support.ros_messages import (
     BASELINE_M,
     COMPRESSED,
@@ -327,11 +330,11 @@ def test_a_flipped_bit_in_an_image_is_named(compression: str, is_chunked: bool, 
     writer.finish()
     path, data = tmp_path / "flight.mcap", stream.getvalue()
     path.write_bytes(data)
-    check_chunks(path)
+    check_bag(path)
     place = data.index(images[0]) + 1500 if compression == "NONE" or not is_chunked else 8 + len(data) // 4
     path.write_bytes(flipped(data, place))
     with pytest.raises(ValueError, match=r"flight\.mcap: is (damaged: |truncated or damaged)"):
-        check_chunks(path)
+        check_bag(path)
 
 
 def chunk_of_mcap(compression: bytes, size: int, body: bytes) -> bytes:
@@ -368,3 +371,41 @@ def test_chunks_that_would_fill_the_memory_are_refused(data: bytes, message: str
     path.write_bytes(data)
     with pytest.raises(ValueError, match=f"^{path}: is .*({message})"):
         RosBag(path)
+
+
+def packed_bag(folder: Path, mode: str) -> tuple[Path, Path]:
+    """A recording that says to be compressed with zstd, and its file of messages."""
+    bag = write_bag2(folder / "flight", stereo((1.0, 2.0)), StoragePlugin.SQLITE3)
+    text = (bag / "metadata.yaml").read_text().replace("compression_format: ''", "compression_format: zstd")
+    (bag / "metadata.yaml").write_text(text.replace("compression_mode: ''", f"compression_mode: {mode}"))
+    return bag, bag / "flight.db3"
+
+
+def test_a_file_that_would_fill_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag, messages = packed_bag(tmp_path, "FILE")
+    (bag / "metadata.yaml").write_text((bag / "metadata.yaml").read_text().replace(".db3", ".db3.zstd"))
+    packed = bag / "flight.db3.zstd"
+    packed.write_bytes(zstd.compress(messages.read_bytes()))
+    messages.unlink()
+    assert RosBag(bag).count == 2
+    monkeypatch.setattr(bag_chunks, "MOST_CHUNK_BYTES", 2**20)
+    packed.write_bytes(packed.read_bytes() + zstd.compress(ZEROS))
+    with pytest.raises(ValueError, match=r"flight\.db3\.zstd: is damaged: expands to more than \d+ bytes"):
+        RosBag(bag)
+
+
+def test_a_message_that_would_fill_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(untrusted_files, "MOST_MEMORY_BYTES", 2**27)
+    bag, messages = packed_bag(tmp_path, "MESSAGE")
+    bomb = zstd.compress(ZEROS) * 20
+    with sqlite3.connect(messages) as database:
+        database.execute("update messages set data = ?", (bomb,))
+    with pytest.raises(ValueError, match=r"flight: is damaged: .*takes more than .* bytes of memory"):
+        RosBag(bag)
+
+
+def test_a_long_table_of_contents_is_refused(tmp_path: Path) -> None:
+    bag = write_bag2(tmp_path / "flight", stereo((1.0,)))
+    (bag / "metadata.yaml").write_text("# " + "x" * 2**20)
+    with pytest.raises(ValueError, match="flight: cannot be read as a ROS bag: has more than 1048576 bytes"):
+        RosBag(bag)

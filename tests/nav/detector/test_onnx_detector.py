@@ -299,3 +299,25 @@ def test_an_endless_network_hears_of_an_interrupt(tmp_path: Path, monkeypatch: p
         signal.signal(signal.SIGINT, before)
     # The network itself ends too.
     threads[-1].join()
+
+
+def test_a_network_that_grows_beyond_the_memory_is_refused(tmp_path: Path) -> None:
+    """A few hundred bytes whose result, or a constant part, has 14 GB."""
+    shape = helper.make_tensor("shape", TensorProto.INT64, [4], [1, 1, 60_000, 60_000])
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["batch", 3, 64, 96])
+    result = helper.make_tensor_value_info("found", TensorProto.FLOAT, None)
+    for first, second in (
+        (helper.make_node("Expand", ["one", "shape"], ["found"]), helper.make_node("ReduceSum", ["images"], ["one"])),
+        (
+            helper.make_node("Add", ["images", "one"], ["found"]),
+            helper.make_node("ConstantOfShape", ["shape"], ["one"]),
+        ),
+    ):
+        graph = helper.make_graph([second, first], "grows", [images], [result], [shape])
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+        model.ir_version = 8
+        file = tmp_path / "grows.onnx"
+        file.write_bytes(model.SerializeToString())
+        with pytest.raises(ValueError, match=r"grows\.onnx: (does not run|is truncated or not)") as caught:
+            OnnxDetector(file)
+        one_line(caught, file)

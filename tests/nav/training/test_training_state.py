@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import errno
+import io
 import resource
 import signal
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -61,5 +63,18 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
     whole = tmp_path / "whole.pt"
     save_checkpoint(whole, {"weights": torch.zeros(1000)})
     path.write_bytes(whole.read_bytes()[:-500])
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or not a checkpoint"):
+        load_checkpoint(path)
+
+
+def test_a_compressed_checkpoint_is_refused(tmp_path: Path) -> None:
+    """A megabyte of zeros that are compressed would be a tensor of a gigabyte."""
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(path, {"weights": torch.zeros(1000)})
+    assert load_checkpoint(path) is not None
+    stored = zipfile.ZipFile(io.BytesIO(path.read_bytes()))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name))
     with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or not a checkpoint"):
         load_checkpoint(path)
