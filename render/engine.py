@@ -117,6 +117,15 @@ def crash_advice(name: str) -> str:
     return f"; if it stays so, delete {kernel_cache()}, its cache of compiled kernels, which may be damaged"
 
 
+def has_compiled(name: str, device: Device = "cpu") -> bool:
+    """Whether a process that begins finds the engine's compiled code, or needs none; else one should go first."""
+    if name != "mitsuba":
+        return True
+    from render.mitsuba_engine.variant import has_kernels, probe_variant
+
+    return has_kernels(probe_variant(device))
+
+
 def _check_device(name: str, device: Device) -> None:
     if device not in DEVICES:
         raise ValueError(f"device: must be {' or '.join(DEVICES)}, got {device!r}")

@@ -34,7 +34,7 @@ from droguekit.batch.worker_pool import (
     run_tasks,
 )
 from labelgen.export.annotations.coco import write_annotations
-from render.engine import crash_advice, engine_notice
+from render.engine import crash_advice, engine_notice, has_compiled
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
@@ -160,6 +160,8 @@ def _record_attempt(
         totals.retries += not attempt.final
         if attempt.final:
             drops.append(Drop(frame_index=attempt.index, reason=reason))
+    if attempt.output:
+        events.write("output", frame=attempt.index, attempt=attempt.number, text=attempt.output)
     report.note(_progress_note(totals.retries, len(drops), attempt.workers_gib))
     if attempt.final:
         report.advance()
@@ -183,7 +185,8 @@ def _attempts(
         return run_on_cluster(task, todo, options.scheduler, timeout_s, stop)
     workers = min(options.worker_count(), len(todo))
     share_gib = available_memory_gib() / max(workers, 1)
-    limits = WorkerLimits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib))
+    is_cold = not has_compiled(task.recipe.render.engine, options.device)
+    limits = WorkerLimits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib), is_first_alone=is_cold)
     return run_tasks(task, todo, workers, limits, stop, task.pack)
 
 

@@ -6,6 +6,7 @@ The first Ctrl-C finishes running tasks, the second stops at once.
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import multiprocessing
 import os
 import pickle
@@ -87,6 +88,7 @@ _CONTEXT = multiprocessing.get_context("spawn")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 T = TypeVar("T")
 MAX_ATTEMPTS = 3
+_MOST_OUTPUT = 4000
 
 
 _NATIVE_FAULTS = (signal.SIGILL, signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE)
@@ -128,12 +130,17 @@ class Worker:
             OSError: it cannot be started.
         """
         self.connection, there = _CONTEXT.Pipe()
+        # In memory, so that a run that is killed leaves no file. A connection takes its descriptor to the process.
+        self._output = os.memfd_create("droguekit-worker")
+        fcntl.fcntl(self._output, fcntl.F_SETFL, os.O_APPEND)
+        output: Connection[Any, Any] = Connection(os.dup(self._output), readable=False)
         self._process = _CONTEXT.Process(
-            target=_serve, args=(there, function, then, os.getpid()), name="droguekit-worker"
+            target=_serve, args=(there, output, function, then, os.getpid()), name="droguekit-worker"
         )
         with one_thread_in_new_processes():
             self._process.start()
         there.close()
+        output.close()
         self.index: int | None = None
         self.is_ready = False
         self.tasks_done = 0
@@ -164,6 +171,13 @@ class Worker:
             self.kill()
             raise WorkerDiedError(self._process.exitcode) from error
 
+    def take_output(self) -> str:
+        """What it wrote to standard output and error since the last call, as a compiler in it does; the end of it."""
+        size = os.fstat(self._output).st_size
+        data = os.pread(self._output, _MOST_OUTPUT, max(0, size - _MOST_OUTPUT)) if size else b""
+        os.ftruncate(self._output, 0)
+        return data.decode("utf-8", "replace").strip()
+
     def kill(self) -> None:
         """Kill it with all processes that it started."""
         try:
@@ -174,6 +188,11 @@ class Worker:
         self.connection.close()
         remove_scratch_folders(self._process.pid or 0)
 
+    def __del__(self) -> None:
+        """Forget what it wrote."""
+        with suppress(AttributeError, OSError):
+            os.close(self._output)
+
     def shut_down(self) -> None:
         """Let it end; it has no task."""
         self.connection.close()
@@ -182,6 +201,7 @@ class Worker:
 
 def _serve(
     connection: Connection[Any, Any],
+    output: Connection[Any, Any],
     function: Callable[[int], Any],
     then: Callable[[int, Any], Any] | None,
     parent: int,
@@ -189,6 +209,9 @@ def _serve(
     """The main loop of a worker: answers each index with (value, error, resident memory in GiB)."""
     # In a process group of its own, Ctrl-C reaches only the parent, and a kill also reaches what an engine started.
     os.setpgid(0, 0)
+    # Several processes at a terminal would write into each other's lines, and into those of the progress.
+    for standard in (1, 2):
+        os.dup2(output.fileno(), standard)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a cluster sends it to every process of a job; the parent decides
     _die_with_parent(parent)
     connection.send(READY)
@@ -245,11 +268,13 @@ class WorkerLimits:
         timeout_s: for one task, from its start; None for no limit. [s]
         tasks_per_process: after which the process is replaced, since renderers leak some memory with every frame.
         process_gib: a process that holds more memory after a task is replaced; None for no limit. [GiB]
+        is_first_alone: whether one worker ends its first task before the others start, as it fills a cache for them.
     """
 
     timeout_s: float | None = None
     tasks_per_process: int = 500
     process_gib: float | None = None
+    is_first_alone: bool = False
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -274,6 +299,7 @@ class TaskAttempt(Generic[T]):
         error: what it raised, `WorkerDiedError` when its process died, `TaskTimeoutError` when it took too long.
         final: whether this was the last attempt.
         workers_gib: memory of all workers together after their latest tasks, 0.0 where unknown. [GiB]
+        output: what its process wrote to standard output and error meanwhile, the end of it.
     """
 
     index: int
@@ -282,6 +308,7 @@ class TaskAttempt(Generic[T]):
     error: BaseException | None
     final: bool
     workers_gib: float = 0.0
+    output: str = ""
 
 
 def is_accident(error: BaseException | None) -> bool:
@@ -341,6 +368,7 @@ class _WorkerPool(Generic[T]):
         self._start, self._waiting, self._size, self._limits = start, waiting, size, limits
         self._workers: list[Worker] = []
         self._failures: Counter[int] = Counter()
+        self._may_share = not limits.is_first_alone
         self._deaths_at_start = 0
 
     def fill(self, stopping: bool) -> bool:
@@ -355,7 +383,8 @@ class _WorkerPool(Generic[T]):
             if self._waiting:
                 worker.assign(self._waiting.popleft())
         starting = sum(not worker.is_ready for worker in self._workers)
-        for _ in range(min(self._size - len(self._workers), len(self._waiting) - starting)):
+        size = self._size if self._may_share else 1
+        for _ in range(min(size - len(self._workers), len(self._waiting) - starting)):
             self._workers.append(self._start())
         return bool(self._waiting) or any(worker.index is not None for worker in self._workers)
 
@@ -395,9 +424,10 @@ class _WorkerPool(Generic[T]):
             worker.is_timed = False
             return
         value, raised, worker.resident_gib = message
-        index = cast(int, worker.index)
+        index, output = cast(int, worker.index), worker.take_output()
+        self._may_share = True
         if is_accident(raised):
-            yield self._fail(worker, raised)
+            yield self._fail(worker, raised, output)
             return
         worker.index, worker.is_timed = None, False
         worker.tasks_done += 1
@@ -407,18 +437,20 @@ class _WorkerPool(Generic[T]):
         ):
             self._workers.remove(worker)
             worker.shut_down()
-        yield TaskAttempt(index, self._failures[index] + 1, value, raised, True, workers_gib)
+        yield TaskAttempt(index, self._failures[index] + 1, value, raised, True, workers_gib, output)
 
-    def _fail(self, worker: Worker, error: BaseException) -> TaskAttempt[T]:
+    def _fail(self, worker: Worker, error: BaseException, output: str = "") -> TaskAttempt[T]:
         """Kill the worker of a failed task, and queue the task again if it has attempts left."""
         index = cast(int, worker.index)
         self._workers.remove(worker)
         worker.kill()
+        output = output or worker.take_output()
         self._failures[index] += 1
         final = self._failures[index] >= MAX_ATTEMPTS
         if not final:
             self._waiting.append(index)
-        return TaskAttempt(index, self._failures[index], None, error, final, self._resident_gib())
+        self._may_share = self._may_share or final
+        return TaskAttempt(index, self._failures[index], None, error, final, self._resident_gib(), output)
 
     def _resident_gib(self) -> float:
         return sum(worker.resident_gib for worker in self._workers)
@@ -432,7 +464,9 @@ class _WorkerPool(Generic[T]):
         self._workers.remove(worker)
         self._deaths_at_start += not worker.is_ready
         if self._deaths_at_start >= max(MAX_ATTEMPTS, self._size):
-            raise OSError(f"worker processes end before their first task; the last: {error}") from error
+            said = worker.take_output().splitlines()[-1:]
+            reason = "; it said: ".join([str(error), *said])
+            raise OSError(f"worker processes end before their first task; the last: {reason}") from error
 
     def kill(self) -> None:
         """Kill all workers."""

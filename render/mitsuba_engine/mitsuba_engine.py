@@ -17,7 +17,7 @@ from render.device import Device
 from render.engine import EyeRadiance, StereoRadiance
 from render.mitsuba_engine.render_noise import MonteCarloNoise, measure_noise
 from render.mitsuba_engine.trace_request import DROGUE_PARTS, TraceRequest, TraceResult
-from render.mitsuba_engine.variant import Variant, probe_variant
+from render.mitsuba_engine.variant import Variant, note_kernels, probe_variant
 from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import environment_radiance
@@ -46,6 +46,7 @@ class MitsubaEngine:
         # Processes that compile the same kernel at the same time warn that another one has stored it first.
         dr.set_log_level(dr.LogLevel.Error)
         self.variant = chosen
+        self._is_noted = False
         self.version = engine_version(chosen)
         if chosen.variant == "scalar_rgb":
             from render.mitsuba_engine.scalar_tracer import ScalarTracer
@@ -90,6 +91,9 @@ class MitsubaEngine:
             seen.apply_air(air, optical_depth_per_m)
             seen.limit_edges(optical_depth_per_m)
             traced.duplicate_error[eye] *= duplicate.apply_air(*air_in_front(frame, duplicate.pixel))
+        if not self._is_noted:
+            note_kernels(self.variant)
+            self._is_noted = True
         noise = _noise(frame, traced, background)
         eyes = {eye: traced.eyes[eye].composite_over(background[eye]) for eye in EYES}
         stage_s["composite"] = time.process_time() - started

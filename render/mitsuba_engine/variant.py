@@ -8,6 +8,7 @@ with the run, as a machine may have been short of memory or time.
 from __future__ import annotations
 
 import atexit
+import hashlib
 import json
 import os
 import platform
@@ -26,6 +27,7 @@ from typing import Any
 from datasets_manifest.atomic import make_scratch_folder
 from render.device import Device, kernel_module
 from render.engine import EngineUnavailableError
+from render.version import RENDER_VERSION
 
 LLVM_REMEDY = "apt-get install libllvm19 (or another one from 17 on)"
 """Debian 12 has 19. Mitsuba 3.9.0 works with 15 too; 3.9.1 aborts the process with 15 and 16."""
@@ -225,6 +227,22 @@ def _is_spoilt(path: Path, now_s: float) -> bool:
         return True
     version, compressed, *_ = struct.unpack(_KERNEL_HEADER, head)
     return bool(version == _KERNEL_VERSION and size != struct.calcsize(_KERNEL_HEADER) + compressed)
+
+
+def has_kernels(chosen: Variant) -> bool:
+    """Whether a process has rendered with this variant before, whose kernels others then load."""
+    return chosen.variant == "scalar_rgb" or _stamp(chosen).exists()
+
+
+def note_kernels(chosen: Variant) -> None:
+    """Remember beside the kernels that those of a whole frame are there."""
+    with suppress(OSError):
+        _stamp(chosen).touch()
+
+
+def _stamp(chosen: Variant) -> Path:
+    parts = (*_versions(), RENDER_VERSION, chosen.variant, str(chosen.library or chosen.gpu), _cpu_model())
+    return kernel_cache() / f"droguekit-{hashlib.sha256('|'.join(parts).encode()).hexdigest()[:16]}"
 
 
 def _provide_home() -> None:

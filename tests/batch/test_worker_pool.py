@@ -87,6 +87,17 @@ def die_with_a_folder(index):
         (folder / "mesh.ply").write_text("mesh")
         os.kill(os.getpid(), signal.SIGKILL)
 
+def talk(index):
+    print(f"standard output {index}")
+    os.write(2, b"x" * 5000 + f" LLVM says {index}".encode())
+    if index == 1:
+        os.write(2, b", and dies")
+        os.kill(os.getpid(), signal.SIGABRT)
+
+def siblings(index):
+    parent = os.getppid()
+    return len(Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
+
 def tell_and_wait(pipe, index):
     with open(pipe, "w") as stream:
         stream.write(f"{os.getpid()}\\n")
@@ -126,6 +137,31 @@ def test_a_task_that_always_kills_its_worker_is_given_up_and_the_others_are_done
     assert [attempt.number for attempt in deaths] == list(range(1, MAX_ATTEMPTS + 1))
     assert [attempt.final for attempt in deaths] == [False] * (MAX_ATTEMPTS - 1) + [True]
     assert {attempt.index: attempt.value for attempt in attempts if attempt.final} == {0: 0, 1: None, 2: 4}
+
+
+def test_what_a_worker_writes_is_kept_for_the_log(tasks: ModuleType, capfd: pytest.CaptureFixture[str]) -> None:
+    attempts = [*run_tasks(tasks.talk, range(3), 1)]
+    told = {(attempt.index, attempt.number): attempt.output for attempt in attempts}
+    # The end of it, and of each attempt its own.
+    assert {key: text.lstrip("x") for key, text in told.items()} == {
+        (0, 1): " LLVM says 0",
+        (2, 1): " LLVM says 2",
+        **{(1, number): " LLVM says 1, and dies" for number in (1, 2, 3)},
+    }
+    assert all(len(text) <= 4000 and "standard output" not in text for text in told.values())
+    assert capfd.readouterr() == ("", "")
+
+
+def test_one_worker_may_go_first(tasks: ModuleType) -> None:
+    """It fills a cache that the others then read."""
+    limits = WorkerLimits(is_first_alone=True)
+    attempts = {attempt.index: attempt.value for attempt in run_tasks(tasks.siblings, range(4), 3, limits)}
+    before = len(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
+    assert attempts[0] == before + 1
+    assert sorted(attempts) == [0, 1, 2, 3]
+    # A first task that fails for good does not hold up the others.
+    values = {each.index: each.value for each in run_tasks(partial(tasks.refuse, 0), range(4), 3, limits)}
+    assert values == {0: None, 1: 1, 2: 4, 3: 9}
 
 
 def test_a_killed_worker_leaves_no_temporary_folder(

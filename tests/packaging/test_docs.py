@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
@@ -13,11 +14,14 @@ import numpy as np
 import pytest
 
 import droguekit
-from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.recipe import FrameCounts, Recipe, load_recipe
+from datasets_manifest.recipe.rigs import _RigTable
 from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import MAX_MARKERS
 from drogue_models.presets import PRESETS
-from droguekit.cli.main import COMMANDS, load_command
+from droguekit.cli.main import COMMANDS, DONE, FAULT, INTERRUPTED, WRONG_INPUT, load_command
+from droguekit.workflows.rendering import MOST_TIMEOUT_S
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
 from nav.pair_navigator import BINARY_METHODS
@@ -65,6 +69,28 @@ def test_commands_and_their_options_exist(page: Path) -> None:
         assert name in COMMANDS, line
         options = {option for parameter in load_command(name).params for option in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= options, line
+
+
+def test_limits_are_those_of_the_code() -> None:
+    page = text("docs/reference/limits.md")
+    rows = re.findall(r"^\| .* \| (\d+)[^|]* \| `([a-z_.]+)\.([A-Z_]+)` \|$", page, re.MULTILINE)
+    assert len(rows) > 20
+    for number, module, constant in rows:
+        assert int(number) == getattr(importlib.import_module(module), constant), constant
+    frames, table = FrameCounts.model_fields, _RigTable.model_fields
+    limits = {
+        "pairs": frames["count"].metadata[1].le,
+        "scenes": frames["scenes"].metadata[1].le,
+        "families": Recipe.model_fields["families"].metadata[0].max_length,
+        "width or height of an image": table["width_px"].metadata[1].le,
+        "markers of a drogue": MAX_MARKERS,
+        "time for a frame (`--timeout`)": int(MOST_TIMEOUT_S),
+    }
+    for name, limit in limits.items():
+        assert re.search(rf"^\| {re.escape(name)} \| {limit} ", page, re.MULTILINE), name
+    codes = {"done": DONE, "the work found a fault": FAULT, "wrong usage or input": WRONG_INPUT}
+    for meaning, code in {**codes, "interrupted": INTERRUPTED}.items():
+        assert re.search(rf"^\| {code} \| {meaning}", page, re.MULTILINE), meaning
 
 
 def test_targets_of_make_exist() -> None:
