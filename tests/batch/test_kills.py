@@ -1,11 +1,14 @@
-"""SIGKILL at random instants, to a worker, to the run or to all of its processes: the dataset is as without them."""
+"""SIGKILL at random instants, and a disk, a home and frames that go away: the dataset is as without them."""
 
 from __future__ import annotations
 
 import os
+import resource
+import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +24,9 @@ from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes, render_re
 
 # A look at the folder this often; what is awaited may take as long as the machine needs.
 _LOOK_EVERY_S = 0.02
+# In what surroundings a run starts, and what happens to its finished frames meanwhile.
+SURROUNDINGS = ("usual", "usual", "no home", "full disk", "nobody listens")
+HARMS = ("none", "vanished frame", "damaged file", "half a frame")
 
 
 class KilledRun:
@@ -29,9 +35,10 @@ class KilledRun:
     def __init__(self, recipe: Path, out: Path, scratch: Path, rng: np.random.Generator) -> None:
         self._command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), "--out", str(out)]
         self._out, self._rng = out, rng
-        self._environment = {**os.environ, "TMPDIR": str(scratch)}
+        self._environment = {"XDG_CACHE_HOME": "", **os.environ, "TMPDIR": str(scratch)}
         self._process: subprocess.Popen[bytes] | None = None
         self.kills = 0
+        self.faults: Counter[str] = Counter()
 
     def go_on_until(self, is_reached: Callable[[], bool], longest_s: float) -> bool:
         """Let it run until a condition holds, and then for a random time of up to `longest_s`.
@@ -40,13 +47,44 @@ class KilledRun:
             Whether it is still at work.
         """
         if self._process is None or self._process.poll() is not None:
-            command = [*self._command, "--workers", "2"]
-            self._process = subprocess.Popen(
-                command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environment
-            )
+            self._start(str(self._rng.choice(SURROUNDINGS)))
         while not is_reached() and not self._ends_within(_LOOK_EVERY_S):
             pass
         return not self._ends_within(float(self._rng.uniform(0, longest_s)))
+
+    def _start(self, surroundings: str) -> None:
+        """Start it, in a part of the cases where it cannot keep a cache, write much, or say anything."""
+        self.faults[surroundings] += 1
+        environment, most_bytes = dict(self._environment), int(self._rng.integers(5_000, 60_000))
+        if surroundings == "no home":
+            del environment["XDG_CACHE_HOME"]
+            environment["HOME"] = "/proc"
+        with Path("/dev/full" if surroundings == "nobody listens" else os.devnull).open("wb") as output:
+            self._process = subprocess.Popen(
+                [*self._command, "--workers", "2"],
+                stdout=output,
+                stderr=output,
+                env=environment,
+                # A file that must not grow any more ends like one on a full disk.
+                preexec_fn=(lambda: _limit_files(most_bytes)) if surroundings == "full disk" else None,
+            )
+
+    def harm(self) -> None:
+        """Do something to a finished frame, whether the run is at work or not."""
+        kind, there = str(self._rng.choice(HARMS)), layout.frame_indices(self._out)
+        if kind == "none" or not there:
+            return
+        self.faults[kind] += 1
+        folder = layout.frame_folder(self._out, int(self._rng.choice(there)))
+        name = str(self._rng.choice([layout.RECORD_FILE, "left.png", "right_parts.png"]))
+        with suppress(FileNotFoundError):
+            if kind == "vanished frame":
+                shutil.rmtree(folder)
+            elif kind == "half a frame":
+                (folder / name).unlink()
+            else:
+                data = (folder / name).read_bytes()
+                (folder / name).write_bytes(data[: int(self._rng.integers(0, len(data)))])
 
     def frames(self) -> int:
         """Number of finished frames."""
@@ -87,6 +125,11 @@ class KilledRun:
         return True
 
 
+def _limit_files(most_bytes: int) -> None:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+
 def torture(recipe_text: str, kills: int, folder: Path) -> None:
     """Kill a run so many times while it renders a recipe, and compare with an undisturbed one."""
     calm, out, recipe, scratch = folder / "calm", folder / "out", folder / "recipe.toml", folder / "scratch"
@@ -109,11 +152,13 @@ def torture(recipe_text: str, kills: int, folder: Path) -> None:
                 goal = min(planned, run.frames() + more)
                 is_at_work = run.go_on_until(lambda goal=goal: run.frames() >= goal, 0.3 if more == 0 else 0.05)
             if is_at_work:
+                run.harm()
                 run.kill()
     finally:
         run.end()
     print(
-        f"{run.kills} kills, {run.begins()} starts, {run.frames()} of {planned} pairs, {len(leftovers(out))} leftovers"
+        f"{run.kills} kills, {run.begins()} starts, {run.frames()} of {planned} pairs, {len(leftovers(out))} "
+        f"leftovers; {dict(run.faults)}"
     )
     summary = render_recipe(out, text=recipe_text)
     assert summary.drops == ()
