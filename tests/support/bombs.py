@@ -439,14 +439,12 @@ BOMBS: dict[str, Bomb] = {
     "mesh stl": Bomb(_file("body.stl", lambda: bytes(80) + struct.pack("<I", 2**31) + bytes(900_000)), _read_mesh),
     "calibration matrix": Bomb(_file("a.yaml", lambda: _opencv_yaml(100_000)), lambda path: read_calibration([path])),
     "calibration numbers": Bomb(
-        _file("a.yaml", lambda: b"%YAML:1.0\n---\n" + _repeated("1", "M1: [", "]")),
+        _file("a.yaml", lambda: _repeated("1", "%YAML:1.0\n---\nM1: [", "]")),
         lambda path: read_calibration([path]),
     ),
     "calibration yaml": Bomb(_file("a.yaml", lambda: b"- a\n" * 65_000), lambda path: read_calibration([path])),
     "calibration xml": Bomb(
-        _file(
-            "a.xml", lambda: b'<?xml version="1.0"?><opencv_storage><a>' + b"1 " * 450_000 + b"</a></opencv_storage>"
-        ),
+        _file("a.xml", lambda: b'<?xml version="1.0"?><opencv_storage><a>' + b"1 " * 50_000 + b"</a></opencv_storage>"),
         lambda path: read_calibration([path]),
     ),
     "bag file": _bag("bag", _compress_file),
