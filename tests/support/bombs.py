@@ -46,8 +46,8 @@ from droguekit.scoring.results.detection_result import read_detections
 from geometry.pinhole import PinholeCamera
 from labelgen.validation.dataset_checks import validate_dataset
 from nav.detector.onnx_detector import OnnxDetector
-from nav.training.starting_weights import read_starting_weights
 from nav.training.training_settings import build_settings
+from nav.training.training_state import read_starting_weights
 from scenes.sky.equirectangular_sky import load_map
 from tests.support.recipe_builder import recipe_text
 from tests.support.ros_messages import stereo, write_bag2
