@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-RENDER_VERSION = "9"
+RENDER_VERSION = "10"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
+from scenes.clouds.thin_layers import mist_depth
 from scenes.ground_view import FARTHEST_M
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.photometry import Radiance, hemisphere, henyey_greenstein
@@ -209,14 +210,18 @@ class LayeredAir:
         result: Radiance = (even + peak).astype(np.float32)
         return result
 
-    def mist_opacity(self, up: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """(...) opacity of the mist, by the vertical component of unit directions."""
-        mist = self._environment.mist
+    def behind_mist(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
+        """Put mist in front of (H, W, 3) radiance along (H, W, 3) unit directions, in place."""
+        mist, light = self._environment.mist, self.mist_light(directions)
         assert mist is not None
-        reach_m = np.where(up > 0, np.float32(mist.above_m), np.float32(mist.below_m))
-        path_m = reach_m / np.maximum(np.abs(up), np.float32(1e-6))
-        opacity: NDArray[np.float32] = (1.0 - np.exp(-np.float32(mist.extinction_per_m) * path_m)).astype(np.float32)
-        return opacity
+        if mist.patchiness > 0:
+            depth, tone = mist_depth(mist, directions, self._environment.camera_offset_m)
+            light *= tone[..., None]
+        else:
+            reach_m = np.where(directions[..., 2] > 0, np.float32(mist.above_m), np.float32(mist.below_m))
+            path_m = reach_m / np.maximum(np.abs(directions[..., 2]), np.float32(1e-6))
+            depth = np.float32(mist.extinction_per_m) * path_m
+        radiance += (1.0 - np.exp(-depth))[..., None] * (light - radiance)
 
 
 def transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
@@ -226,5 +231,5 @@ def transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
 
 def direct_share(layers: tuple[CloudLayer, ...]) -> float:
     """Mean share of light that the layers transmit directly."""
-    shares = [1.0 - layer.cover_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
+    shares = [1.0 - layer.shading_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
     return float(np.prod(shares)) if shares else 1.0

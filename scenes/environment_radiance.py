@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
 from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
-from scenes.clouds.cloud_layers import band_limited, render_cloud_layer
-from scenes.clouds.ray_march import upsample
+from scenes.clouds.cloud_layers import CloudLayerRenderer
 from scenes.ground.ground_radiance import Ground
 from scenes.ground.sea import GroundLight
 from scenes.ground_view import pixel_angle_rad
@@ -26,8 +25,8 @@ from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.photometry import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
 
 _LIGHT_MAP_HEIGHT_PX = 128
-# Large images evaluate clouds at every second pixel: 5 m at 5 km, which is less than the width of their edges.
-_CLOUD_STEP_PX, _MANY_RAYS = 2, 60_000
+# Pictures of so many rays do not march all of them through clouds.
+_MANY_RAYS = 60_000
 
 
 class EnvironmentRadiance:
@@ -108,8 +107,7 @@ class EnvironmentRadiance:
             total[part] *= 1.0 - picture[..., 3:]
             total[part] += picture[..., :3]
         if self.environment.mist is not None:
-            hidden = self.air.mist_opacity(directions[..., 2])[..., None]
-            total += hidden * (self.air.mist_light(directions) - total)
+            self.air.behind_mist(total, directions)
         return total
 
     def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
@@ -187,17 +185,19 @@ class EnvironmentRadiance:
         """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity."""
         if directions.size == 0:
             return np.zeros((*directions.shape[:2], 4), dtype=np.float32)
-        many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
-        every = _CLOUD_STEP_PX if many else 1
-        chosen, behind_air = directions[::every, ::every], air[::every, ::every]
-        light_on, offset_m = self.air.light_on(layer), self.environment.camera_offset_m
-        seen = render_cloud_layer(layer, chosen, light_on, every, offset_m, self.air.round_horizon_sine)
-        light = self.air.before_cloud(seen.radiance, chosen, seen.distance_m, behind_air)
-        # Light times opacity is interpolated, because light is undefined where there is no cloud.
-        layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
-        if not many:
-            return layered
-        return upsample(band_limited(layered, layer, chosen), every, (directions.shape[0], directions.shape[1]))
+        light, offset_m = self.air.light_on(layer), self.environment.camera_offset_m
+        renderer = CloudLayerRenderer(layer, light, offset_m, self.air.round_horizon_sine)
+        rays, behind_air = directions.reshape(-1, 3), air.reshape(-1, 3)
+
+        def through_air(seen: Radiance, distance_m: NDArray[np.float32], indices: NDArray[np.int64]) -> Radiance:
+            return self.air.before_cloud(seen, rays[indices], distance_m, behind_air[indices])
+
+        if directions.shape[0] * directions.shape[1] >= _MANY_RAYS:
+            return renderer.picture(directions, through_air)
+        seen = renderer.view(directions, pixel_angle_rad(directions))
+        lit = self.air.before_cloud(seen.radiance, directions, seen.distance_m, air)
+        layered: Radiance = np.concatenate([lit * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
+        return layered
 
     @cached_property
     def light_map(self) -> Radiance:

@@ -59,7 +59,9 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
         ground_texture_seed=ground_texture_seed,
         wind_speed_m_s=sample_uniform(ground_rng, ranges.wind_speed_m_s),
         clouds=tuple(layer for layer in layers if layer is not None),
-        mist=sample_mist(frame_generator(seed, scene_id, "mist"), ranges.mist),
+        mist=sample_mist(
+            frame_generator(seed, scene_id, "mist"), frame_generator(seed, scene_id, "mist patches"), ranges.mist
+        ),
         moon=sample_moon(frame_generator(seed, scene_id, "moon"), ranges.moon),
         sky_model=ranges.sky_model,
     )
@@ -108,12 +110,15 @@ def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, cloud
     return layer if rng.random() < clouds.scene_fraction else None
 
 
-def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
-    """Mist around the camera, or None."""
+def sample_mist(rng: np.random.Generator, patch_rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
+    """Mist around the camera, or None; its patches come from `patch_rng`."""
+    patchiness = sample_uniform(patch_rng, ranges.patchiness)
     mist = Mist(
         visibility_m=sample_uniform(rng, ranges.visibility_m),
         above_m=sample_uniform(rng, ranges.above_m),
         below_m=sample_uniform(rng, ranges.below_m),
+        patchiness=patchiness,
+        texture_seed=int(patch_rng.integers(1, 2**31)) if patchiness > 0 else 0,
     )
     return mist if rng.random() < ranges.scene_fraction else None
 

@@ -36,6 +36,8 @@ class Clouds(FrozenModel):
         height.within(-15000, 15000, "height_above_camera_m")
         if height.low < 100 and height.high > -100:
             raise ValueError("height_above_camera_m: the whole range must lie above 100 m or below -100 m")
+        if self.kind == "rain" and height.low < 0:
+            raise ValueError("height_above_camera_m: rain must end above the camera")
         self.cover_fraction.within(0, 1, "cover_fraction")
         self.thickness_m.within(10, 5000, "thickness_m")
         self.feature_size_m.within(10, 1e5, "feature_size_m")
@@ -49,19 +51,21 @@ class MistRanges(FrozenModel):
 
     Attributes:
         scene_fraction: share of scenes in mist.
-        visibility_m, above_m, below_m: see `Mist`.
+        visibility_m, above_m, below_m, patchiness: see `Mist`.
     """
 
     scene_fraction: Fraction = 0.0
     visibility_m: Range = Range(low=80, high=600)
     above_m: Range = Range(low=50, high=400)
     below_m: Range = Range(low=50, high=400)
+    patchiness: Range = Field(default=Range(low=0, high=0), exclude_if=lambda patchiness: patchiness.high == 0)
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:
         self.visibility_m.within(10, 100_000, "visibility_m")
         self.above_m.within(0.1, 10_000, "above_m")
         self.below_m.within(0.1, 10_000, "below_m")
+        self.patchiness.within(0, 1, "patchiness")
         return self
 
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from drogue_models.frozen_model import FrozenModel, ReflectanceRgb
 from drogue_models.untrusted_files import read_regular
 
-CloudKind = Literal["cumulus", "stratus", "cirrus"]
+CloudKind = Literal["cumulus", "congestus", "stratus", "altocumulus", "cirrus", "contrail", "rain"]
 
 GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town"]
 
@@ -26,18 +26,23 @@ MIN_AIRSPEED_M_S = 5.0
 
 MAP_SUFFIXES = (".exr", ".hdr")
 
+# Six contrails some 500 m wide over a few tens of kilometres.
+_CONTRAIL_SHARE = 0.1
+
 
 class CloudLayer(FrozenModel):
     """A layer of cloud above or below the camera.
 
     Attributes:
-        kind: `cumulus` heaps with a flat base, `stratus` a mottled sheet, `cirrus` thin streaks of ice.
+        kind: `cumulus` heaps with a flat base, `congestus` towers, `stratus` a mottled sheet, `altocumulus` small cells
+            in one sheet, `cirrus` streaks of ice, `contrail` trails of aircraft, `rain` shafts that hang down to
+            `height_above_camera_m` or evaporate before.
         height_above_camera_m: of the side that faces the camera: the base above it, or, negative, the top below. [m]
-        thickness_m: from base to the highest tops; cirrus ignores it. [m]
-        cover_fraction: share of the layer's plan that is cloud.
+        thickness_m: from base to the highest tops; cirrus and contrails ignore it. [m]
+        cover_fraction: share of the layer's plan that is cloud; of contrails it sets the number, one to six.
         feature_size_m: size of the largest clouds. [m]
         optical_depth: in the thick parts, vertically.
-        heading_deg: direction of cirrus streaks, from east towards north. [deg]
+        heading_deg: direction of streaks and trails, and against which rain leans, from east towards north. [deg]
         texture_seed: seed of its pattern.
     """
 
@@ -54,6 +59,8 @@ class CloudLayer(FrozenModel):
     def _not_inside(self) -> Self:
         if abs(self.height_above_camera_m) < 100:
             raise ValueError("height_above_camera_m: the camera must stay 100 m clear of a layer; inside, use mist")
+        if self.kind == "rain" and self.height_above_camera_m < 0:
+            raise ValueError("height_above_camera_m: rain must end above the camera")
         return self
 
     @property
@@ -61,18 +68,28 @@ class CloudLayer(FrozenModel):
         """Whether it lies above the camera."""
         return self.height_above_camera_m > 0
 
+    @property
+    def shading_fraction(self) -> float:
+        """Share of the layer's plan that takes light: of contrails a small part of what `cover_fraction` says."""
+        return self.cover_fraction * (_CONTRAIL_SHARE if self.kind == "contrail" else 1.0)
+
 
 class Mist(FrozenModel):
-    """Homogeneous thin cloud around the camera, between two levels.
+    """Thin cloud around the camera, between two levels.
 
     Attributes:
-        visibility_m: meteorological range in it (2 % contrast). [m]
+        visibility_m: meteorological range in it (2 % contrast), of patchy mist around the camera. [m]
         above_m, below_m: extent above and below the camera. [m]
+        patchiness: 0 for the same density everywhere, 1 for patches and layers between which it is nearly clear.
+        texture_seed: seed of the patches.
     """
 
     visibility_m: float = Field(ge=10, le=100_000)
     above_m: float = Field(gt=0, le=10_000)
     below_m: float = Field(gt=0, le=10_000)
+    # Left out at their defaults, so that the hashes of scenes with even mist stay those of earlier versions.
+    patchiness: float = Field(default=0.0, ge=0, le=1, exclude_if=lambda share: share == 0.0)
+    texture_seed: int = Field(default=0, ge=0, exclude_if=lambda seed: seed == 0)
 
     @property
     def extinction_per_m(self) -> float:

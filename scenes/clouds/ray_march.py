@@ -1,82 +1,357 @@
-"""Ray marching through a cloud layer: optical depth of each ray, and where the cloud's surface is."""
+"""Marching of rays through cloud layers: how much of each ray a layer hides, where, and how deep inside."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.clouds.cloud_density import CloudDensity
-
 _Field = NDArray[np.float32]
+_Loop = TypeVar("_Loop", bound=Callable[..., Any])
 
-# Steps through a layer by kind: inside a cloud, and at its edges, where a ray may hit little of it.
-_STEPS = {"cumulus": 30, "stratus": 16}
-_EDGE_STEPS = {"cumulus": 36, "stratus": 20}
-# A ray at an edge starts before the nearest cloud around it, and ends behind the farthest, by these factors.
-_BEFORE_CLOUD, _BEHIND_CLOUD = np.float32(0.92), np.float32(1.05)
-# Lengths of the steps towards the sun, in thicknesses of the layer.
-_SUN_STEPS = (0.05, 0.09, 0.16, 0.3)
-# A surface is visible behind less optical depth than this; behind the other depth nothing is visible.
-_SEEN_AT_DEPTH, _MOST_DEPTH = 0.5, np.float32(16.0)
-_SURFACE_ITERATIONS = 2
-# Light comes on average from this optical depth inside the surface.
-_LIGHT_DEPTH = 1.5
-# Neighbouring rays that differ by this factor in distance, or by this much in transmission, have an edge between them.
-_EDGE_DISTANCE, _EDGE_THROUGH = 1.08, 0.25
-_ROW = 256
-# Rays that are marched at a time, so that they fit the processor's cache.
-_RAYS_AT_ONCE = 12_000
+EARTH_M = 6.371e6
+# Shapes of clouds with depth; the numbers are known to the compiled loops.
+HEAP, SHEET, CELLS = 0, 1, 2
+# Of a ray; a step is at least this share of the distance.
+_MOST_STEPS, _LEAST_STEP, _CROWD = 180, 0.006, 0.12
+_SURFACE_ITERATIONS = 3
+# Behind this optical depth nothing is seen; light comes on average from the other.
+MOST_DEPTH = 2.6
 _NOWHERE_M = 1e9
+_SUN_STEPS = 5
+# Each octave of lumps is finer by this factor and turned by these cosines and sines about two axes.
+_FINER = 2.13
+_MASK, _TILE_PX, _LUMPS_MASK = 511, 512.0, 63
+_BLOB_TEXELS, _LUMP_TEXELS = 64.0, 64.0 / 6.0
 
 
-@dataclass(frozen=True, eq=False)
-class MarchResult:
-    """Cloud along rays.
-
-    Attributes:
-        depth: (H, W) optical depth of all cloud in the ray.
-        distance_m: (H, W) distance of its surface. [m]
-        towards_sun: (H, W) optical depth from the surface towards the sun.
-    """
-
-    depth: _Field
-    distance_m: _Field
-    towards_sun: _Field
+def compiled(loop: _Loop) -> _Loop:
+    """Compile at the first call, and cache the result where possible; no reordering of floating-point operations."""
+    try:
+        quick: _Loop = numba.njit(loop, cache=True, error_model="numpy", nogil=True)
+    except RuntimeError:  # no folder for the cache can be written
+        quick = numba.njit(loop, error_model="numpy", nogil=True)
+    return quick
 
 
-def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[np.float64], every: int) -> MarchResult:
-    """March (H, W, 3) unit directions.
+@compiled
+def tile_at(tile: NDArray[np.float32], u: float, v: float) -> float:
+    """Value of a (512, 512) periodic tile at column u and row v, bilinear."""
+    left, top = np.floor(u), np.floor(v)
+    a, b = u - left, v - top
+    i, j = int(left) & _MASK, int(top) & _MASK
+    right, below = (i + 1) & _MASK, (j + 1) & _MASK
+    upper = tile[j, i] + a * (tile[j, right] - tile[j, i])
+    lower = tile[below, i] + a * (tile[below, right] - tile[below, i])
+    return upper + b * (lower - upper)
+
+
+@compiled
+def lump_at(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
+    """Value of the periodic volume of lumps at a place in lumps, trilinear."""
+    x, y, z = x * _LUMP_TEXELS, y * _LUMP_TEXELS, z * _LUMP_TEXELS
+    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+    a, b, c = x - fx, y - fy, z - fz
+    i, j, k = int(fx) & _LUMPS_MASK, int(fy) & _LUMPS_MASK, int(fz) & _LUMPS_MASK
+    i1, j1, k1 = (i + 1) & _LUMPS_MASK, (j + 1) & _LUMPS_MASK, (k + 1) & _LUMPS_MASK
+    e = volume[k, j, i] + a * (volume[k, j, i1] - volume[k, j, i])
+    f = volume[k, j1, i] + a * (volume[k, j1, i1] - volume[k, j1, i])
+    g = volume[k1, j, i] + a * (volume[k1, j, i1] - volume[k1, j, i])
+    h = volume[k1, j1, i] + a * (volume[k1, j1, i1] - volume[k1, j1, i])
+    e += b * (f - e)
+    g += b * (h - g)
+    return e + c * (g - e)
+
+
+@compiled
+def excess_at(
+    shape: NDArray[np.float64],
+    body: NDArray[np.float32],
+    lumps: NDArray[np.float32],
+    x_m: float,
+    y_m: float,
+    height_m: float,
+    detail_m: float,
+) -> float:
+    """How deep a place is inside the cloud, about; negative outside. [m]
+
+    Far from the surface it is a bound on that side of which it is: what remains of the detail cannot change the side.
 
     Args:
-        density: of the layer.
-        directions: neighbours in the array must be neighbours in direction if `every` is not 1.
-        sun: (3,) unit vector.
-        every: march one in so many rays down and across, and of the others those at edges.
+        shape: see `CloudShape`.
+        body, lumps: textures.
+        x_m, y_m: place east and north of the layer's origin. [m]
+        height_m: over the base. [m]
+        detail_m: size of the smallest detail that matters. [m]
     """
-    kind = density.layer.kind
-    if every == 1:
-        return _march_all(density, directions, sun, _EDGE_STEPS[kind])
-    coarse = _march_all(density, np.ascontiguousarray(directions[::every, ::every]), sun, _STEPS[kind])
-    size = (directions.shape[0], directions.shape[1])
-    # Distance and light are undefined where there is no cloud: both are interpolated with the cloud's weight.
-    weight = 1.0 - np.exp(-coarse.depth) + np.float32(1e-3)
-    stacked = np.stack([coarse.depth, weight, coarse.distance_m * weight, coarse.towards_sun * weight], axis=-1)
-    fine = upsample(stacked, every, size)
-    depth, distance_m, towards_sun = fine[..., 0], fine[..., 2] / fine[..., 1], fine[..., 3] / fine[..., 1]
-    edges, nearest_m, last_m = _edges(coarse)
-    edge = np.flatnonzero(upsample(edges, every, size) > 0)
-    if len(edge):
-        # Whole rows of rays, because textures are sampled as images.
-        padded = np.resize(edge, (-(-len(edge) // _ROW), _ROW))
-        block = padded // size[1] // every, padded % size[1] // every
-        ends_m = _BEFORE_CLOUD * nearest_m[block], last_m[block] + np.float32(density.layer.thickness_m)
-        near = _march_all(density, directions.reshape(-1, 3)[padded], sun, _EDGE_STEPS[kind], ends_m)
-        for values, marched in ((depth, near.depth), (distance_m, near.distance_m), (towards_sun, near.towards_sun)):
-            values.reshape(-1)[padded] = marched
-    return MarchResult(depth=depth, distance_m=distance_m, towards_sun=towards_sun)
+    kind, size_m, thick_m, threshold = int(shape[0]), shape[1], shape[2], shape[3]
+    metric_m, lump_m, lump_amount = shape[4], shape[5], shape[6]
+    fine_m, fine_amount_m, gain, shift = shape[7], shape[8], shape[9], shape[10]
+    h = height_m * (1.0 / thick_m)
+    if h < -0.1:
+        return -0.5 * thick_m - (-0.1 - h) * thick_m
+    if h > 1.2:
+        return -0.1 * thick_m - (h - 1.2) * thick_m
+    # The patterns repeat along axes at this angle to the flight; otherwise repeats would line up in the view ahead.
+    texels_per_m, lumps_per_m = _BLOB_TEXELS / size_m, 1.0 / lump_m
+    u = (x_m * 0.93233 + y_m * 0.36162) * texels_per_m
+    v = (y_m * 0.93233 - x_m * 0.36162) * texels_per_m
+    lx, ly, lz = x_m * lumps_per_m + shift, y_m * lumps_per_m + 0.37 * shift, height_m * lumps_per_m
+    if kind == HEAP:
+        square = h * h
+        fall = shape[12] * square + shape[13] * square * square
+        wide = tile_at(body, u, v) - threshold
+        wide /= 1.0 + 0.25 * max(wide, 0.0)
+        # The most that lumps of all sizes can add.
+        most = metric_m * (wide - fall + 0.5 * lump_amount * (0.35 + h)) + 0.33 * fine_amount_m / (1.0 - gain)
+        if most < 0.0:
+            return most
+        swell = lump_at(lumps, lx, ly, lz)
+        turret = lump_at(lumps, 2.2 * ly + 0.3, 2.2 * lz, 2.2 * lx)
+        excess = wide + lump_amount * (0.35 + h) * (swell + 0.5 * turret) - fall
+        excess *= metric_m
+        floor = height_m - 0.03 * thick_m * (1.0 - swell)
+        fine = min(max(0.15 + 3.5 * h, 0.15), 1.0)
+        excess = min(excess, floor)
+    elif kind == SHEET:
+        swell = lump_at(lumps, lx, ly, 0.6 * lz)
+        wide = tile_at(body, u, v)
+        other = tile_at(body, 1.9 * v + 131.0, 1.9 * u)
+        top = thick_m * (0.68 + lump_amount * swell + 0.10 * other)
+        floor = height_m - thick_m * (0.14 - 0.13 * swell + 0.04 * other)
+        fine = min(max(0.25 + 1.6 * h, 0.25), 1.0)
+        excess = min(min(top - height_m, floor), metric_m * (wide - threshold + 0.4 * swell))
+    else:
+        patch = tile_at(body, 0.11 * u, 0.15 * v) + 0.4 * tile_at(body, v, u)
+        cell = lump_at(lumps, lx, ly, 0.4 * lz)
+        small = lump_at(lumps, 2.3 * ly, 2.3 * lx + 0.5, 0.9 * lz)
+        middle = 2.0 * h - 1.0
+        excess = metric_m * (lump_amount * (cell + 0.45 * small) + 0.45 * patch - threshold - 0.9 * middle * middle)
+        fine = 1.0
+    remaining_m = fine * fine_amount_m / (1.0 - gain)
+    amount_m, scale = fine * fine_amount_m, 1.0 / fine_m
+    # A lump of less than 1.4 details is not seen, one of 2.8 fully.
+    seen, deep_m = 0.7 * fine_m / detail_m, 3.0 * shape[11]
+    px, py, pz = x_m * scale + 1.7 * shift, y_m * scale, height_m * scale
+    while seen > 1.0:
+        if excess + 0.33 * remaining_m < 0.0:
+            return excess + 0.33 * remaining_m
+        if excess - remaining_m > deep_m:
+            return excess - remaining_m
+        excess += amount_m * min(seen - 1.0, 1.0) * lump_at(lumps, px, py, pz)
+        remaining_m -= amount_m
+        amount_m *= gain
+        seen *= 1.0 / _FINER
+        px, py, pz = _FINER * (0.8 * py + 0.6 * pz) + 0.31, _FINER * (0.8 * pz - 0.6 * py), _FINER * px
+    return excess
+
+
+@compiled
+def lumps_at(
+    shape: NDArray[np.float64], lumps: NDArray[np.float32], x_m: float, y_m: float, height_m: float, detail_m: float
+) -> float:
+    """How far lumps stand out of the larger shape at a place; negative in the creases. [m]"""
+    amount_m, scale, total_m = shape[8], 1.0 / shape[7], 0.0
+    seen = 0.7 * shape[7] / detail_m
+    px, py, pz = x_m * scale + 1.7 * shape[10], y_m * scale, height_m * scale
+    while seen > 1.0:
+        total_m += amount_m * min(seen - 1.0, 1.0) * lump_at(lumps, px, py, pz)
+        amount_m *= shape[9]
+        seen *= 1.0 / _FINER
+        px, py, pz = _FINER * (0.8 * py + 0.6 * pz) + 0.31, _FINER * (0.8 * pz - 0.6 * py), _FINER * px
+    return total_m
+
+
+@compiled
+def _height_m(z: float, distance_m: float, bend: float, base_m: float) -> float:
+    return z * distance_m + bend * distance_m * distance_m - base_m
+
+
+@compiled
+def march_rays(
+    shape: NDArray[np.float64],
+    body: NDArray[np.float32],
+    lumps: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    ends_m: NDArray[np.float32],
+    place: NDArray[np.float64],
+    sun: NDArray[np.float64],
+    found: NDArray[np.float32],
+) -> None:
+    """March every ray and fill in what it met.
+
+    Args:
+        shape, body, lumps: as in `excess_at`.
+        rays: (N, 3) unit directions.
+        ends_m: (N, 2) distances at which each ray enters and leaves the layer. [m]
+        place: east and north of the camera [m], height of the base over it [m], bend of level [1/m], angle between
+            rays [rad], extinction [1/m].
+        sun: (3,) unit vector.
+        found: (N, 6) filled in: optical depth, distance of the visible cloud [m], optical depth from there towards the
+            sun, height there over the layer's thickness, how far it stands out of the larger shape [m], and the
+            distance at which the ray enters cloud [m].
+    """
+    east_m, north_m, base_m, bend = place[0], place[1], place[2], place[3]
+    pixel_rad, extinction = place[4], place[5]
+    thick_m, softness_m = shape[2], shape[11]
+    layer_m = abs(base_m) + thick_m
+    for index in range(rays.shape[0]):
+        x, y, z = float(rays[index, 0]), float(rays[index, 1]), float(rays[index, 2])
+        near_m, far_m = float(ends_m[index, 0]), float(ends_m[index, 1])
+        at_m, before_m, depth, weighted_m, weight = near_m, near_m, 0.0, 0.0, 0.0
+        inside, steps, outside_m, entry_m = False, 0, -1.0, _NOWHERE_M
+        while at_m < far_m and depth < MOST_DEPTH and steps < _MOST_STEPS:
+            steps += 1
+            # Far away clouds stand behind each other closer than rays do.
+            crowd = 1.0 + _CROWD * at_m / layer_m
+            detail_m, least_m = at_m * pixel_rad * crowd, _LEAST_STEP * at_m
+            height_m = _height_m(z, at_m, bend, base_m)
+            deep_m = excess_at(shape, body, lumps, x * at_m + east_m, y * at_m + north_m, height_m, detail_m)
+            if deep_m <= 0.0:
+                inside = False
+                before_m, outside_m = at_m, min(deep_m, -1e-3)
+                at_m += max(-0.7 * deep_m, least_m, 1.5 * detail_m, 3.0)
+                continue
+            if not inside:
+                inside = True
+                low_m, high_m, low, high = before_m, at_m, outside_m, deep_m
+                if at_m > near_m:
+                    # By regula falsi after Illinois: an end that stays counts half.
+                    for _ in range(_SURFACE_ITERATIONS):
+                        middle_m = low_m + (high_m - low_m) * low / (low - high)
+                        height_m = _height_m(z, middle_m, bend, base_m)
+                        value = excess_at(
+                            shape, body, lumps, x * middle_m + east_m, y * middle_m + north_m, height_m, detail_m
+                        )
+                        if value > 0.0:
+                            high_m, high, low = middle_m, value, 0.5 * low
+                        else:
+                            low_m, low, high = middle_m, min(value, -1e-3), 0.5 * high
+                at_m = high_m
+                entry_m = min(entry_m, at_m)
+            soft_m = max(softness_m * (1.0 + 2.5 * max(1.0 - 3.0 * height_m / thick_m, 0.0)), 1.5 * detail_m)
+            step_m = max(0.8 / extinction, 0.5 * soft_m, 0.5 * least_m)
+            middle_m = at_m + 0.5 * step_m
+            height_m = _height_m(z, middle_m, bend, base_m)
+            dense = excess_at(
+                shape, body, lumps, x * middle_m + east_m, y * middle_m + north_m, height_m, 3.0 * detail_m
+            )
+            dense = min(max(dense / soft_m, 0.0), 1.0)
+            dense *= dense
+            more = dense * extinction * step_m
+            hides = np.exp(-depth) * (1.0 - np.exp(-more))
+            weighted_m += hides * middle_m
+            weight += hides
+            depth += more
+            before_m, outside_m = at_m, -1e-3
+            at_m += step_m
+        found[index, 0] = depth
+        found[index, 5] = entry_m
+        if weight <= 0.0:
+            found[index, 1] = near_m
+            found[index, 2:5] = 0.0
+            continue
+        at_m = weighted_m / weight
+        detail_m = at_m * pixel_rad
+        px, py, pz = x * at_m + east_m, y * at_m + north_m, _height_m(z, at_m, bend, base_m)
+        way_m, step_m, towards = 0.0, max(5.0, detail_m), 0.0
+        for step in range(_SUN_STEPS):
+            middle_m = way_m + 0.5 * step_m
+            inner = excess_at(
+                shape,
+                body,
+                lumps,
+                px + sun[0] * middle_m,
+                py + sun[1] * middle_m,
+                pz + sun[2] * middle_m,
+                max(2.0 * detail_m, 0.5 * step_m),
+            )
+            soft_m = max(softness_m, 0.5 * step_m)
+            towards += min(max(inner / soft_m, 0.0), 1.0) * extinction * step_m
+            way_m += step_m
+            step_m *= 2.6
+            if step == _SUN_STEPS - 2:
+                step_m = max(step_m, 0.8 * thick_m - way_m)
+        found[index, 1] = at_m
+        found[index, 2] = towards
+        found[index, 3] = pz / thick_m
+        found[index, 4] = lumps_at(shape, lumps, px, py, pz, detail_m)
+
+
+@compiled
+def layer_excess(
+    shape: NDArray[np.float64],
+    body: NDArray[np.float32],
+    lumps: NDArray[np.float32],
+    places_m: NDArray[np.float64],
+    detail_m: float,
+) -> NDArray[np.float64]:
+    """(N,) results of `excess_at` for (N, 3) places: east, north, and height over the base. [m]"""
+    excess_m = np.empty(places_m.shape[0])
+    for index in range(places_m.shape[0]):
+        x_m, y_m, height_m = places_m[index, 0], places_m[index, 1], places_m[index, 2]
+        excess_m[index] = excess_at(shape, body, lumps, x_m, y_m, height_m, detail_m)
+    return excess_m
+
+
+@compiled
+def starts_of(entry_m: NDArray[np.float32], every: int, index: NDArray[np.int64], width: int) -> NDArray[np.float32]:
+    """Distance before which rays surely meet no cloud, or 1e9 where none is near. [m]
+
+    Args:
+        entry_m: (h, w) distances at which every `every`-th ray down and across enters cloud, 1e9 for none. [m]
+        every: see there.
+        index: (N,) flat indices of the rays in a picture.
+        width: of that picture.
+    """
+    height, across = entry_m.shape
+    starts = np.empty(index.size, dtype=np.float32)
+    for which in range(index.size):
+        row, column = index[which] // width // every, index[which] % width // every
+        least = np.float32(_NOWHERE_M)
+        for j in range(max(row - 1, 0), min(row + 3, height)):
+            for i in range(max(column - 1, 0), min(column + 3, across)):
+                least = min(least, entry_m[j, i])
+        starts[which] = least
+    return starts
+
+
+@compiled
+def enlarge(
+    coarse: NDArray[np.float32], every: int, contrast: float, large: NDArray[np.float32], edge: NDArray[np.bool_]
+) -> None:
+    """Fill in a picture between every `every`-th of its rays, and mark where that is not good enough.
+
+    Args:
+        coarse: (h, w, 4) light times opacity, and opacity, of every `every`-th ray down and across.
+        every: see there.
+        contrast: of light, over that of the brightest corner, or of opacity, between corners that marks an edge.
+        large: (H, W, 4) filled in.
+        edge: (H, W) filled in.
+    """
+    height, width = coarse.shape[0], coarse.shape[1]
+    for row in range(large.shape[0]):
+        j, b = row // every, np.float32(row % every) / np.float32(every)
+        k = min(j + 1, height - 1)
+        for column in range(large.shape[1]):
+            i, a = column // every, np.float32(column % every) / np.float32(every)
+            right = min(i + 1, width - 1)
+            one = np.float32(1.0)
+            for c in range(4):
+                upper = coarse[j, i, c] * (one - a) + coarse[j, right, c] * a
+                lower = coarse[k, i, c] * (one - a) + coarse[k, right, c] * a
+                large[row, column, c] = upper * (one - b) + lower * b
+            marked = False
+            if a > 0 or b > 0:
+                for c in range(1, 4, 2):
+                    most = max(max(coarse[j, i, c], coarse[j, right, c]), max(coarse[k, i, c], coarse[k, right, c]))
+                    least = min(min(coarse[j, i, c], coarse[j, right, c]), min(coarse[k, i, c], coarse[k, right, c]))
+                    marked = marked or most - least > contrast * (most if c == 1 else one)
+            edge[row, column] = marked
 
 
 def upsample(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -87,106 +362,3 @@ def upsample(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> N
         image, to_coarse, size[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
     return large
-
-
-def _edges(coarse: MarchResult) -> tuple[_Field, _Field, _Field]:
-    """Where edges of cloud are, and where cloud begins and ends.
-
-    Returns:
-        (H, W) 1 at rays next to an edge of the cloud or between two clouds, 0 elsewhere; (H, W) distance of the nearest
-        cloud in the ray or its eight neighbours, 0 without any [m]; and (H, W) distance behind which there is none,
-        known where one of them has little or none. [m]
-    """
-    block = np.ones((3, 3), dtype=np.uint8)
-    through = np.exp(-coarse.depth)
-    cloudy = through < 0.97
-    farthest = cv2.dilate(np.where(cloudy, coarse.distance_m, np.float32(0.0)), block)
-    nearest = cv2.erode(np.where(cloudy, coarse.distance_m, np.float32(_NOWHERE_M)), block)
-    clearest = cv2.dilate(through, block)
-    frayed = clearest - cv2.erode(through, block) > _EDGE_THROUGH
-    edge: _Field = (frayed | (farthest > _EDGE_DISTANCE * nearest)).astype(np.float32)
-    last = np.where((clearest > 0.5) & (farthest > 0), _BEHIND_CLOUD * farthest, np.float32(_NOWHERE_M))
-    return edge, np.where(nearest < _NOWHERE_M, nearest, np.float32(0.0)), last
-
-
-def _march_all(
-    density: CloudDensity,
-    directions: NDArray[np.float32],
-    sun: NDArray[np.float64],
-    steps: int,
-    ends_m: tuple[_Field, _Field] | None = None,
-) -> MarchResult:
-    """March every ray, between distances `ends_m` (H, W) where those lie inside the layer."""
-    rise = directions[..., 2] * np.float32(1.0 if density.layer.is_above else -1.0)
-    near_m, far_m = density.crossing(rise)
-    if ends_m is not None:
-        near_m, far_m = (np.clip(end_m, near_m, far_m) for end_m in ends_m)
-    depth, distance_m, towards_sun = (np.empty_like(near_m) for _ in range(3))
-    inside_m = np.float32(_LIGHT_DEPTH / density.extinction_per_m)
-    several = max(1, _RAYS_AT_ONCE // directions.shape[1])
-    for first in range(0, directions.shape[0], several):
-        rows = slice(first, first + several)
-        depth[rows], distance_m[rows] = _through(density, directions[rows], (near_m[rows], far_m[rows]), steps)
-        if depth[rows].any():
-            place = density.place(directions[rows], distance_m[rows] + inside_m)
-            towards_sun[rows] = _depth_towards_sun(density, place, sun)
-        else:
-            towards_sun[rows] = 0.0
-    return MarchResult(depth=depth, distance_m=distance_m, towards_sun=towards_sun)
-
-
-def _through(
-    density: CloudDensity, directions: NDArray[np.float32], ends_m: tuple[_Field, _Field], steps: int
-) -> tuple[_Field, _Field]:
-    """Optical depth between two distances, and distance of the surface.
-
-    Density is linear between samples, so that its edge is between them and not at one of them.
-    """
-    near_m, far_m = ends_m
-    total = np.zeros(near_m.shape, dtype=np.float32)
-    step_m = (far_m - near_m) / np.float32(steps)
-    per_step = step_m * np.float32(density.extinction_per_m)
-    before = density.excess(directions, near_m)
-    entry_m, outside, inside = near_m.copy(), np.full_like(near_m, -1e-6), np.full_like(near_m, 1e6)
-    for index in range(1, steps + 1):
-        here = density.excess(directions, near_m + np.float32(index) * step_m)
-        enters = (before <= 0) & (here > 0) & (total < _SEEN_AT_DEPTH)
-        np.copyto(entry_m, near_m + np.float32(index - 1) * step_m, where=enters)
-        np.copyto(outside, before, where=enters)
-        np.copyto(inside, here, where=enters)
-        total += np.minimum(_mean_positive(before, here) * np.float32(density.steepness), 1.0) * per_step
-        before = here
-        if total.min() >= _MOST_DEPTH:
-            break
-    np.minimum(total, _MOST_DEPTH, out=total)
-    # The surface between the two samples, by regula falsi; each iteration keeps the end that still brackets it.
-    low, high = np.zeros_like(entry_m), np.ones_like(entry_m)
-    for _ in range(_SURFACE_ITERATIONS):
-        part = low + (high - low) * outside / (outside - inside)
-        value = density.excess(directions, entry_m + part * step_m)
-        beyond = value > 0
-        high, inside = np.where(beyond, part, high), np.where(beyond, value, inside)
-        low, outside = np.where(beyond, low, part), np.where(beyond, outside, value)
-    return total, entry_m + (low + (high - low) * outside / (outside - inside)) * step_m
-
-
-def _mean_positive(first: _Field, last: _Field) -> _Field:
-    """Mean of the positive part of a value that varies linearly from `first` to `last`."""
-    change = last - first
-    flat = np.abs(change) < 1e-4
-    a, b = np.maximum(first, 0.0), np.maximum(last, 0.0)
-    mean: _Field = np.where(flat, 0.5 * (a + b), 0.5 * (b * b - a * a) / np.where(flat, np.float32(1.0), change))
-    return mean
-
-
-def _depth_towards_sun(density: CloudDensity, place: NDArray[np.float32], sun: NDArray[np.float64]) -> _Field:
-    """(H, W) optical depth from (H, W, 3) positions towards the sun."""
-    total = np.zeros(place.shape[:2], dtype=np.float32)
-    reached = 0.0
-    for step in _SUN_STEPS:
-        length_m = step * density.layer.thickness_m
-        at = place + sun.astype(np.float32) * np.float32(reached + 0.5 * length_m)
-        inside = np.clip(density.excess_at(at) * np.float32(density.steepness), 0.0, 1.0)
-        total += inside * np.float32(length_m * density.extinction_per_m)
-        reached += length_m
-    return total

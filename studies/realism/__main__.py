@@ -1,4 +1,4 @@
-"""Prints how far the modelled skies are from real ones: `python -m studies.realism`."""
+"""Prints how far the modelled skies and clouds are from real ones: `python -m studies.realism`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.environment import Environment, SkyModel
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
+from studies.realism.cloud_measures import cloud_table
 
 SKY_MODELS: tuple[SkyModel, ...] = ("daylight", "scattering")
 # The visibilities at which both have a common clear day: around the camera, and at the ground.
@@ -144,8 +146,12 @@ def sky_table() -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m studies.realism", description=__doc__)
-    parser.parse_args(arguments)
-    print(sky_table())
+    parser.add_argument("--photographs", nargs="*", type=Path, default=[], help="pictures of clouds to measure too")
+    parser.add_argument("--clouds", action="store_true", help="measure clouds alone")
+    given = parser.parse_args(arguments)
+    if not given.clouds:
+        print(sky_table(), end="\n\n")
+    print(cloud_table(given.photographs))
 
 
 if __name__ == "__main__":

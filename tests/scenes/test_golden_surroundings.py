@@ -23,7 +23,11 @@ TO_SUN = np.array([0.6, 0.0, 0.8])
 CLOUDS = {
     "cumulus": {"cover_fraction": 0.5, "thickness_m": 300.0, "optical_depth": 10.0},
     "stratus": {"cover_fraction": 0.9, "thickness_m": 300.0, "optical_depth": 4.0},
+    "congestus": {"cover_fraction": 0.4, "thickness_m": 900.0, "optical_depth": 20.0},
+    "altocumulus": {"cover_fraction": 0.6, "thickness_m": 300.0, "optical_depth": 4.0},
     "cirrus": {"cover_fraction": 0.7, "optical_depth": 0.5},
+    "contrail": {"cover_fraction": 0.7, "optical_depth": 0.5},
+    "rain": {"cover_fraction": 0.4, "optical_depth": 0.5},
 }
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer, Environment, Moon
-from scenes.clouds.cloud_density import sample_texture
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.photometry import REC709_FROM_XYZ, direction_from_angles, hemisphere, luminance
@@ -131,13 +130,6 @@ def test_plate_illuminance_of_level_ground_agrees_with_the_sky_integral() -> Non
     up = around.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
     # Two quadratures of the same sky, 4 and 1.4 degrees wide.
     np.testing.assert_allclose(up, around.ground_illuminance_lux, rtol=0.01)
-
-
-def test_texture_repeats_without_a_seam() -> None:
-    x = np.linspace(0, 8, 4097, dtype=np.float32)[None]
-    values = sample_texture(5, 1.6, x, np.zeros_like(x))[0]
-    jumps = np.abs(np.diff(values))
-    assert jumps.max() < 12 * np.median(jumps) + 0.2
 
 
 def level_illuminance_lux(sky: ClearSky) -> float:

@@ -1,0 +1,253 @@
+"""Clouds that light shines through: cirrus, contrails, shafts of rain, and the patches of mist."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.types.environment import CloudLayer, Mist
+from scenes.clouds.cloud_textures import body_tile, ice_tiles
+from scenes.clouds.ray_march import compiled, tile_at
+
+_Field = NDArray[np.float32]
+_BODY_SLOPE, _STRAND_SLOPE, _MIST_SLOPE = 2.6, 1.6, 2.2
+_RAIN_STEPS, _RAIN_REACH_M, _RAIN_LEAN = 24, 3e4, 0.35
+# Steps through mist, up to an optical depth behind which nothing is seen; patches are so many visibilities large.
+_MIST_STEPS, _MIST_DEPTH, _PATCH_PER_VISIBILITY, _LEAST_PATCH_M = 10, 6.0, 0.5, 60.0
+_PATCH_SHADE = 0.3
+
+
+_FRESH_M = 60.0
+# Contrails: at most so many, the widths that they spread to with age, and how far they bend aside. [m]
+_MOST_TRAILS, _TRAIL_WIDTH_M, _TRAIL_BEND_M = 6, (_FRESH_M, 1200.0), 600.0
+
+
+@compiled
+def _ice_depth(
+    tiles: NDArray[np.float32],
+    body: NDArray[np.float32],
+    places: NDArray[np.float64],
+    threshold: float,
+    depth: NDArray[np.float32],
+) -> None:
+    """Fill in depth over its usual amount.
+
+    Args:
+        tiles: as `ice_tiles` gives them.
+        body: texture of the patches.
+        places: (N, 3) along and across the wind, and width of the ray, in sizes of the largest patches.
+        threshold: over which there is a patch.
+        depth: (N,) filled in.
+    """
+    for index in range(places.shape[0]):
+        u, v, width = places[index, 0], places[index, 1], places[index, 2]
+        bend = tile_at(tiles[2], 28.0 * u, 28.0 * v)
+        other = tile_at(tiles[2], 28.0 * v + 211.0, 28.0 * u + 97.0)
+        pu, pv = u + 0.06 * bend, v + 0.08 * other
+        patch = tile_at(body, 55.0 * pu, 70.0 * pv) - threshold
+        wide = tile_at(tiles[0], 90.0 * pu, 160.0 * pv)
+        fine = tile_at(tiles[0], 260.0 * pu + 60.0, 500.0 * pv + 5.0 * other)
+        # Faint where its texels are finer than the rays.
+        seen = min(1.0 / (1400.0 * width), 1.0)
+        finest = seen * tile_at(tiles[0], 700.0 * pu, 1400.0 * pv + 20.0 * other)
+        trail = tile_at(tiles[1], 58.0 * pu, 80.0 * pv)
+        # Smooth from nothing to much: ice thins out over a long way.
+        sum_of_all = 0.5 + 0.65 * patch + 0.5 * wide + 0.35 * fine + 0.5 * (trail - 1.0)
+        amount = np.log1p(np.exp(1.5 * sum_of_all)) / 1.5
+        depth[index] = 0.3 * amount * np.exp(0.12 * wide + 0.18 * fine + 0.18 * finest)
+
+
+@compiled
+def _trail_depth(
+    tiles: NDArray[np.float32], trails: NDArray[np.float64], places: NDArray[np.float64], depth: NDArray[np.float32]
+) -> None:
+    """Fill in depth over its amount in a fresh contrail.
+
+    Args:
+        tiles: as `ice_tiles` gives them.
+        trails: (K, 4) cosine and sine of the direction, distance from the origin across it, and width. [m]
+        places: (N, 3) east, north, and width of the ray. [m]
+        depth: (N,) filled in.
+    """
+    for index in range(places.shape[0]):
+        x_m, y_m, ray_m = places[index, 0], places[index, 1], places[index, 2]
+        total = 0.0
+        for which in range(trails.shape[0]):
+            cosine, sine, aside_m, width_m = trails[which, 0], trails[which, 1], trails[which, 2], trails[which, 3]
+            along_m, across_m = x_m * cosine + y_m * sine, y_m * cosine - x_m * sine - aside_m
+            across_m += _TRAIL_BEND_M * 0.3 * tile_at(tiles[2], along_m / 260.0, 90.0 * which)
+            if abs(across_m) > 6.0 * width_m + 3.0 * ray_m:
+                continue
+            # Puffs hang below a trail, once as far apart as its own width.
+            puff = tile_at(tiles[2], along_m / width_m * 28.0, 40.0 * which + across_m / width_m * 9.0)
+            strand = tile_at(tiles[0], along_m / width_m * 9.0, across_m / width_m * 40.0)
+            spread_m = np.sqrt(width_m * width_m * (1.0 + 0.25 * puff) ** 2 + 0.25 * ray_m * ray_m)
+            near = across_m / spread_m + 0.35 * puff
+            # One edge is sharper, for the wind draws the other out.
+            fall = near * near * (0.35 if near > 0.0 else 1.6)
+            total += np.exp(-fall + 0.30 * strand + 0.25 * puff) * np.sqrt(_FRESH_M / spread_m)
+        depth[index] = total
+
+
+def _trails(layer: CloudLayer) -> NDArray[np.float64]:
+    """(K, 4) contrails of a layer; see `_trail_depth`. Most lie along the heading, as airways do."""
+    rng = frame_generator(layer.texture_seed, 0, "contrails")
+    count = 1 + round(layer.cover_fraction * (_MOST_TRAILS - 1))
+    turned = np.radians(layer.heading_deg + rng.normal(0.0, 14.0, _MOST_TRAILS)) + (
+        np.pi / 2 * (rng.random(_MOST_TRAILS) < 0.2)
+    )
+    aside_m = rng.uniform(-4.0, 4.0, _MOST_TRAILS) * layer.feature_size_m
+    low, high = np.log(_TRAIL_WIDTH_M)
+    width_m = np.exp(low + (high - low) * rng.random(_MOST_TRAILS) ** 1.5)
+    return np.stack([np.cos(turned), np.sin(turned), aside_m, width_m], axis=-1)[:count]
+
+
+def thin_depth(
+    layer: CloudLayer,
+    directions: NDArray[np.float32],
+    distance_m: _Field,
+    pixel_rad: float,
+    offset_m: tuple[float, float],
+) -> _Field:
+    """(H, W) vertical optical depth at distances along (H, W, 3) directions that are `pixel_rad` apart."""
+    east_m = directions[..., 0].astype(np.float64) * distance_m + offset_m[0]
+    north_m = directions[..., 1].astype(np.float64) * distance_m + offset_m[1]
+    width_m = distance_m.astype(np.float64) * pixel_rad
+    depth = np.empty(distance_m.size, dtype=np.float32)
+    tiles = ice_tiles(layer.texture_seed)
+    if layer.kind == "contrail":
+        places = np.stack([east_m.ravel(), north_m.ravel(), width_m.ravel()], axis=-1)
+        _trail_depth(tiles, _trails(layer), places, depth)
+    else:
+        cosine, sine = (float(turn(np.radians(layer.heading_deg))) for turn in (np.cos, np.sin))
+        along_m, across_m = east_m * cosine + north_m * sine, north_m * cosine - east_m * sine
+        places = np.stack([along_m.ravel(), across_m.ravel(), width_m.ravel()], axis=-1) / layer.feature_size_m
+        threshold = float(ndtri(np.clip(1.0 - layer.cover_fraction, 1e-4, 1.0 - 1e-4)))
+        _ice_depth(tiles, body_tile(layer.texture_seed, _BODY_SLOPE), places, threshold, depth)
+    result: _Field = np.float32(layer.optical_depth) * depth.reshape(distance_m.shape)
+    return result
+
+
+@compiled
+def _shaft_depth(
+    body: NDArray[np.float32],
+    fibres: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    ends_m: NDArray[np.float32],
+    numbers: NDArray[np.float64],
+    found: NDArray[np.float32],
+) -> None:
+    """Fill in (N, 2) optical depth and mean distance [m] of rain along (N, 3) rays between (N, 2) distances.
+
+    Args:
+        body, fibres: textures of the showers, and of the strands in them.
+        rays, ends_m: see above.
+        numbers: east and north of the camera, height of the lower end over it, thickness, size of the showers [m],
+            threshold, extinction [1/m], and lean east and north per height.
+        found: see above.
+    """
+    east_m, north_m, base_m, thick_m, size_m = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    for index in range(rays.shape[0]):
+        x, y, z = float(rays[index, 0]), float(rays[index, 1]), float(rays[index, 2])
+        near_m, far_m = float(ends_m[index, 0]), min(float(ends_m[index, 1]), float(ends_m[index, 0]) + _RAIN_REACH_M)
+        step_m = (far_m - near_m) / _RAIN_STEPS
+        depth, weighted_m = 0.0, 0.0
+        for step in range(_RAIN_STEPS):
+            at_m = near_m + (step + 0.5) * step_m
+            h = min(max((z * at_m + at_m * at_m / 1.2742e7 - base_m) / thick_m, 0.0), 1.0)
+            fallen_m = (1.0 - h) * thick_m
+            u = (x * at_m + east_m + numbers[7] * fallen_m) / size_m
+            v = (y * at_m + north_m + numbers[8] * fallen_m) / size_m
+            shower = tile_at(body, 64.0 * u, 64.0 * v) - numbers[5]
+            if shower <= -0.5:
+                continue
+            strand = tile_at(fibres, 300.0 * u, 300.0 * v) + tile_at(fibres, 130.0 * v + 77.0, 130.0 * u)
+            # Drops evaporate on their way: the weaker the shower, the earlier; none begins sharply.
+            left = min(max(2.2 * h + 0.8 * shower - 0.5, 0.0), 1.0) * min(8.0 * (1.0 - h), 1.0)
+            more = left * min(shower + 0.5, 1.5) * np.exp(0.35 * strand) * numbers[6] * step_m
+            depth += more
+            weighted_m += more * at_m
+        found[index, 0] = depth
+        found[index, 1] = weighted_m / depth if depth > 0.0 else near_m
+
+
+def shaft_depth(
+    layer: CloudLayer, directions: NDArray[np.float32], ends_m: tuple[_Field, _Field], offset_m: tuple[float, float]
+) -> tuple[_Field, _Field]:
+    """Optical depth of rain along (H, W, 3) directions between two (H, W) distances, and its mean distance. [m]"""
+    lean = _RAIN_LEAN * np.array([np.cos(np.radians(layer.heading_deg)), np.sin(np.radians(layer.heading_deg))])
+    numbers = np.array(
+        [
+            *offset_m,
+            layer.height_above_camera_m,
+            layer.thickness_m,
+            layer.feature_size_m,
+            float(ndtri(np.clip(1.0 - layer.cover_fraction, 1e-4, 1.0 - 1e-4))),
+            layer.optical_depth / layer.thickness_m,
+            *lean,
+        ]
+    )
+    found = np.empty((directions.shape[0] * directions.shape[1], 2), dtype=np.float32)
+    body, fibres = body_tile(layer.texture_seed, _BODY_SLOPE), body_tile(layer.texture_seed + 1, _STRAND_SLOPE)
+    rays = np.ascontiguousarray(directions.reshape(-1, 3), dtype=np.float32)
+    _shaft_depth(body, fibres, rays, np.stack([end_m.ravel() for end_m in ends_m], axis=-1), numbers, found)
+    return found[:, 0].reshape(directions.shape[:2]), found[:, 1].reshape(directions.shape[:2])
+
+
+@compiled
+def _mist_depth(
+    body: NDArray[np.float32], rays: NDArray[np.float32], numbers: NDArray[np.float64], found: NDArray[np.float32]
+) -> None:
+    """Fill in (N, 2) optical depth of patchy mist along (N, 3) rays, and how dense the visible part is.
+
+    Args:
+        body: texture of the patches.
+        rays: see above.
+        numbers: east and north of the camera, extent of the mist above and below [m], extinction [1/m], patchiness,
+            and size of the patches [m].
+        found: see above.
+    """
+    above_m, below_m, extinction, patchy, size_m = numbers[2], numbers[3], numbers[4], numbers[5], numbers[6]
+    for index in range(rays.shape[0]):
+        x, y, z = float(rays[index, 0]), float(rays[index, 1]), float(rays[index, 2])
+        reach_m = (above_m if z > 0.0 else below_m) / max(abs(z), 1e-6)
+        far_m = min(reach_m, _MIST_DEPTH / extinction)
+        total, before, dense, weight = 0.0, 0.0, 0.0, 1e-6
+        for step in range(_MIST_STEPS):
+            share = (step + 1.0) / _MIST_STEPS
+            share *= share
+            at_m, length_m = 0.5 * (before + share) * far_m, (share - before) * far_m
+            before = share
+            u, v, h = (x * at_m + numbers[0]) / size_m, (y * at_m + numbers[1]) / size_m, z * at_m / size_m
+            noise = tile_at(body, 64.0 * u + 31.0 * h, 64.0 * v + 9.0 * h)
+            noise += 0.6 * tile_at(body, 210.0 * h, 70.0 * u + 25.0 * v) + 0.5 * tile_at(body, 200.0 * v, 200.0 * u)
+            # Around the camera it is what its visibility says.
+            near = at_m / (at_m + 0.1 * size_m)
+            more = np.exp(patchy * near * (0.9 * noise - 0.6 * patchy)) * extinction * length_m
+            hides = np.exp(-total) * (1.0 - np.exp(-more))
+            dense += hides * noise * near
+            weight += hides
+            total += more
+        found[index, 0] = total + (reach_m - far_m) * extinction
+        found[index, 1] = dense / weight
+
+
+def mist_depth(
+    mist: Mist, directions: NDArray[np.floating[Any]], offset_m: tuple[float, float]
+) -> tuple[_Field, _Field]:
+    """Optical depth of mist along (..., 3) unit directions, and its light over the mean; both (...).
+
+    Dense patches stop the light from above; the air between them is brighter.
+    """
+    rays = np.ascontiguousarray(np.reshape(directions, (-1, 3)), dtype=np.float32)
+    found = np.empty((len(rays), 2), dtype=np.float32)
+    size_m = max(_PATCH_PER_VISIBILITY * mist.visibility_m, _LEAST_PATCH_M)
+    numbers = np.array([*offset_m, mist.above_m, mist.below_m, mist.extinction_per_m, mist.patchiness, size_m])
+    _mist_depth(body_tile(mist.texture_seed, _MIST_SLOPE), rays, numbers, found)
+    size = np.shape(directions)[:-1]
+    tone = np.exp(np.float32(-_PATCH_SHADE * mist.patchiness) * np.clip(found[:, 1], -1.5, 1.5))
+    return found[:, 0].reshape(size), tone.reshape(size)
