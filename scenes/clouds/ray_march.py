@@ -47,7 +47,7 @@ def tile_at(tile: NDArray[np.float32], u: float, v: float) -> float:
     right, below = (i + 1) & _MASK, (j + 1) & _MASK
     upper = tile[j, i] + a * (tile[j, right] - tile[j, i])
     lower = tile[below, i] + a * (tile[below, right] - tile[below, i])
-    return upper + b * (lower - upper)
+    return float(upper + b * (lower - upper))
 
 
 @compiled
@@ -64,7 +64,7 @@ def lump_at(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
     h = volume[k1, j1, i] + a * (volume[k1, j1, i1] - volume[k1, j1, i])
     e += b * (f - e)
     g += b * (h - g)
-    return e + c * (g - e)
+    return float(e + c * (g - e))
 
 
 @compiled
@@ -93,9 +93,9 @@ def excess_at(
     fine_m, fine_amount_m, gain, shift = shape[7], shape[8], shape[9], shape[10]
     h = height_m * (1.0 / thick_m)
     if h < -0.1:
-        return -0.5 * thick_m - (-0.1 - h) * thick_m
+        return float(-0.5 * thick_m - (-0.1 - h) * thick_m)
     if h > 1.2:
-        return -0.1 * thick_m - (h - 1.2) * thick_m
+        return float(-0.1 * thick_m - (h - 1.2) * thick_m)
     # The patterns repeat along axes at this angle to the flight; otherwise repeats would line up in the view ahead.
     texels_per_m, lumps_per_m = _BLOB_TEXELS / size_m, 1.0 / lump_m
     u = (x_m * 0.93233 + y_m * 0.36162) * texels_per_m
@@ -109,7 +109,7 @@ def excess_at(
         # The most that lumps of all sizes can add.
         most = metric_m * (wide - fall + 0.5 * lump_amount * (0.35 + h)) + 0.33 * fine_amount_m / (1.0 - gain)
         if most < 0.0:
-            return most
+            return float(most)
         swell = lump_at(lumps, lx, ly, lz)
         turret = lump_at(lumps, 2.2 * ly + 0.3, 2.2 * lz, 2.2 * lx)
         excess = wide + lump_amount * (0.35 + h) * (swell + 0.5 * turret) - fall
@@ -139,15 +139,15 @@ def excess_at(
     px, py, pz = x_m * scale + 1.7 * shift, y_m * scale, height_m * scale
     while seen > 1.0:
         if excess + 0.33 * remaining_m < 0.0:
-            return excess + 0.33 * remaining_m
+            return float(excess + 0.33 * remaining_m)
         if excess - remaining_m > deep_m:
-            return excess - remaining_m
+            return float(excess - remaining_m)
         excess += amount_m * min(seen - 1.0, 1.0) * lump_at(lumps, px, py, pz)
         remaining_m -= amount_m
         amount_m *= gain
         seen *= 1.0 / _FINER
         px, py, pz = _FINER * (0.8 * py + 0.6 * pz) + 0.31, _FINER * (0.8 * pz - 0.6 * py), _FINER * px
-    return excess
+    return float(excess)
 
 
 @compiled

@@ -103,7 +103,8 @@ def _trails(layer: CloudLayer) -> NDArray[np.float64]:
     aside_m = rng.uniform(-4.0, 4.0, _MOST_TRAILS) * layer.feature_size_m
     low, high = np.log(_TRAIL_WIDTH_M)
     width_m = np.exp(low + (high - low) * rng.random(_MOST_TRAILS) ** 1.5)
-    return np.stack([np.cos(turned), np.sin(turned), aside_m, width_m], axis=-1)[:count]
+    trails: NDArray[np.float64] = np.stack([np.cos(turned), np.sin(turned), aside_m, width_m], axis=-1)[:count]
+    return trails
 
 
 def thin_depth(
