@@ -31,8 +31,9 @@ from datasets_manifest.random_streams import sample_generator
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import RECORD_FILE, frame_name
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.types.images import Pixels
+from datasets_manifest.types.images import Pixels, StereoImages
 from datasets_manifest.types.records import ViewRecord
 from drogue_models.marker_layout import marker_layout
 from droguekit.api.recipe_rendering import RECIPE_TEXT
@@ -98,20 +99,41 @@ def _keypoints_px(view: ViewRecord, count: int) -> np.ndarray[Any, np.dtype[np.f
 
 
 class PairDataset(MapDataset[Any]):
-    """A dataset on disk, for `torch.utils.data.DataLoader`."""
+    """A dataset on disk, for `torch.utils.data.DataLoader`.
 
-    def __init__(self, dataset: StereoDataset | str | Path, transform: Transform | None = None) -> None:
+    Attributes:
+        dataset: the pairs.
+        faults: count the pairs that were left out.
+    """
+
+    def __init__(
+        self,
+        dataset: StereoDataset | str | Path,
+        transform: Transform | None = None,
+        *,
+        leave_out_damaged: bool = False,
+    ) -> None:
         """Open the dataset.
 
         Args:
             dataset: a path, a URL, or a selection of pairs.
             transform: changes each sample.
+            leave_out_damaged: read every file once now, and leave out pairs of which one is missing or damaged. Without
+                it, such a pair is an error at its turn.
 
         Raises:
             ValueError: no such dataset, or it cannot be trusted.
         """
         self.dataset = dataset if isinstance(dataset, StereoDataset) else StereoDataset(dataset)
+        self.faults = PairFaults()
+        if leave_out_damaged:
+            read = self.dataset.reader.checked_record if self.dataset.has_truth else self._read_blind
+            whole = [i for i in self.dataset.frame_indices if read_or_note(i, read, self.faults) is not None]
+            self.dataset = StereoDataset(self.dataset.path, whole)
         self._transform = transform
+
+    def _read_blind(self, frame_index: int) -> StereoImages:
+        return self.dataset.frame(frame_index).images
 
     def __len__(self) -> int:
         """Number of pairs."""

@@ -25,12 +25,21 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_centroids import NO_CENTROIDS, BinaryCentroids, box_window, window_centroids
-from nav.centroids.small_centroids import layout_with_room, small_centroids, smallest_gap_m
+from nav.centroids.binary_centroids import (
+    NO_CENTROIDS,
+    BinaryCentroids,
+    box_window,
+    face_centroids,
+    layout_with_room,
+    small_centroids,
+    smallest_gap_m,
+    window_centroids,
+)
 from nav.centroids.small_discs import EDGELESS_RADIUS_PX, LARGEST_SMALL_RADIUS_PX
-from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detector
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.lens_correction import undistort_centroids
+from nav.matching.face_ring import DROWNED_RADIUS_PX
 from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
 from nav.matching.ring_matching import (
     FEW,
@@ -201,16 +210,20 @@ class PairNavigator:
 
     def _centroids_in(self, channel: Pixels, corner_px: tuple[int, int], scale_px_per_m: float) -> BinaryCentroids:
         """Regions in a part of an image, or peaks of light where the markers are too small for regions."""
-        radius_px = self._layout.radius_m * scale_px_per_m
+        radius_px, place = self._layout.radius_m * scale_px_per_m, (corner_px, self._layout, scale_px_per_m)
+        # The light of all lamps of a face counts at once there, and peaks of single ones drown in the sky beside them.
+        if radius_px < DROWNED_RADIUS_PX and (face := face_centroids(channel, *place)) is not None:
+            return face
         peaks = None
         if radius_px < EDGELESS_RADIUS_PX:
-            peaks = small_centroids(channel, corner_px, self._layout, scale_px_per_m)
+            peaks = small_centroids(channel, *place)
             if peaks.ring is not None:
                 return peaks
         regions = window_centroids(channel, corner_px, self._layout)
         if regions.ring is not None or radius_px > LARGEST_SMALL_RADIUS_PX:
             return regions
-        return peaks or small_centroids(channel, corner_px, self._layout, scale_px_per_m)
+        peaks = peaks or small_centroids(channel, *place)
+        return peaks if peaks.ring is not None else face_centroids(channel, *place) or peaks
 
     def _blind_eye(self, centroids: dict[Eye, BinaryCentroids], observation: Observation | NoFixReason) -> str:
         """Why one eye shows no markers where the other one does; else empty."""

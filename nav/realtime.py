@@ -22,6 +22,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from datasets_manifest.storage.blind import BlindPair
+from datasets_manifest.storage.pair_faults import unreadable_reason
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
@@ -30,7 +31,6 @@ from nav.centroids.blurred_edges import blurred_step
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
-from nav.pair_measurement import unreadable_reason
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
 from nav.pose.marker_geometry import project_markers

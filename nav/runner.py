@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Iterator, Sequence
 
 from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.pair_faults import unreadable_reason
 from datasets_manifest.types.estimates import Estimate, NoFix
 from drogue_models.marker_layout import marker_layout
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 from nav.docking import docking_quantities
 from nav.filtering.smoother import SMOOTHER_SUFFIX, smooth
-from nav.pair_measurement import unreadable_reason
 from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.method_registry import method_names, pose_method
 from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 from datasets_manifest.storage.blind import BlindPair
+from datasets_manifest.storage.pair_faults import fault_reason
 from datasets_manifest.types.estimates import Estimate, NoFix
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
@@ -22,7 +23,7 @@ from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
-from nav.pair_measurement import PairMeasurement, fault_reason
+from nav.pair_measurement import PairMeasurement
 from nav.pair_navigator import CentroidChoice, PairNavigator
 from nav.pose.pose_method import NoFixReason
 from nav.tracked_detection import TrackedObserver

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -15,6 +16,7 @@ from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.image_codecs import decode_png
 from datasets_manifest.storage.layout import RECORD_FILE, image_file, is_plain_name, mosaic_file, parts_file
 from datasets_manifest.storage.manifest import Manifest, read_manifest
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.field_types import write_rig
 from datasets_manifest.types.frame import Sensor
@@ -69,6 +71,20 @@ class Dataset:
         """
         return self._parse_record(frame_index, self.frames.read(frame_index, RECORD_FILE))
 
+    def records(self, faults: PairFaults | None = None) -> Iterator[PairRecord]:
+        """The truth of all pairs in the order of their indices.
+
+        Args:
+            faults: count pairs whose record is damaged, which are left out; without, such a pair is an error.
+
+        Raises:
+            ValueError: a record cannot be read, and nothing counts faults; names the file.
+        """
+        for frame_index in self.frame_indices:
+            record = read_or_note(frame_index, self.record, faults)
+            if record is not None:
+                yield record
+
     def sought_drogue(self, record: PairRecord) -> DrogueParameters:
         """The drogue that navigation looks for in a pair, whether the pair shows it or not."""
         return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
@@ -103,6 +119,17 @@ class Dataset:
             files[name] = self.frames.read(frame_index, name)
             self._check_hash(frame_index, name, files[name], expected)
         return record, files
+
+    def checked_record(self, frame_index: int) -> PairRecord:
+        """The truth of one pair whose other files are as they were written.
+
+        Raises:
+            ValueError: the pair is missing or its record wrong, or a file is missing or changed; names it.
+        """
+        record = self.record(frame_index)
+        for name, expected in record.file_sha256.items():
+            self._check_hash(frame_index, name, self.frames.read(frame_index, name), expected)
+        return record
 
     def _check_hash(self, frame_index: int, name: str, data: bytes, expected: str) -> None:
         if hashlib.sha256(data).hexdigest() != expected:

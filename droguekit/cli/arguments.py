@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from datasets_manifest.storage.storage import Location, as_location
+from droguekit.cli.main import FAULT
 from render.device import Device
 
 if TYPE_CHECKING:
@@ -26,6 +27,13 @@ def _local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
     if text is not None and "://" in text:
         raise ValueError(f"{option.opts[0]}: must be a folder or file of this machine, got {text}")
     return None if text is None else Path(text)
+
+
+def exit_with_fault(fault: str | None) -> None:
+    """End the command with exit code 1 and the fault as one line; nothing where there is none."""
+    if fault is not None:
+        typer.echo(f"droguekit: error: {fault}", err=True)
+        raise typer.Exit(FAULT)
 
 
 def places(texts: list[str]) -> list[Location]:

@@ -8,8 +8,9 @@ from typing import Annotated, Literal, cast
 
 import typer
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, output_option
+from droguekit.cli.arguments import DatasetArgument, exit_with_fault, output_option
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 
@@ -143,13 +144,15 @@ def export(
 ) -> None:
     """Write a dataset's labels in another format, with the images where the format has them.
 
-    The command counts and prints what the format cannot represent.
+    The command counts and prints what the format cannot represent. Exits with 1 where a pair is damaged, and leaves it
+    out.
     """
     if image_bits is not None and not images:
         raise ValueError("--image-bits: is for copies; add --images")
     if image_bits not in (None, 8, 16):
         raise ValueError(f"--image-bits: must be 8 or 16, got {image_bits}")
-    log = ExportLog(progress_report())
+    faults = PairFaults()
+    log = ExportLog(progress_report(), faults)
     bits = cast(Literal[8, 16], image_bits or 8) if images else None
     for path in write_export(format_, dataset, out, log, image_bits=bits, estimates=estimates):
         typer.echo(f"wrote {path}")
@@ -157,6 +160,7 @@ def export(
         typer.echo(f"{format_}: {count} x {what}")
     for remark in log.remarks:
         typer.echo(f"{format_}: {remark}")
+    exit_with_fault(faults.line())
 
 
 _FORMAT_LINES = "\n".join(f"  {name:<17} {format_.description}" for name, format_ in FORMATS.items())

@@ -151,7 +151,7 @@ def explain(error: BaseException) -> str:
 
 def _show_pair_faults() -> None:
     """Show the traces of faults that end the work on one pair and not the run."""
-    logger = logging.getLogger("nav.pair_measurement")
+    logger = logging.getLogger("datasets_manifest.storage.pair_faults")
     if not logger.handlers:
         logger.addHandler(logging.StreamHandler())
     logger.setLevel(logging.DEBUG)

@@ -9,8 +9,14 @@ import typer
 
 from datasets_manifest.storage.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption, Place, WorkersOption, output_option
-from droguekit.cli.main import FAULT
+from droguekit.cli.arguments import (
+    DatasetArgument,
+    DetectorOption,
+    Place,
+    WorkersOption,
+    exit_with_fault,
+    output_option,
+)
 
 EXAMPLES = {
     "detect": (
@@ -75,9 +81,7 @@ def detect(
         f"median {counts.times.wall_ms:.1f} ms a pair ({counts.times.cpu_ms:.1f} ms CPU)"
     )
     typer.echo(f"wrote {out}")
-    if counts.fault is not None:
-        typer.echo(f"droguekit: error: {counts.fault}", err=True)
-        raise typer.Exit(FAULT)
+    exit_with_fault(counts.fault)
 
 
 def train(
@@ -132,7 +136,8 @@ def train(
 ) -> None:
     """Train a detector on datasets, evaluate it on their test splits, and export it as ONNX.
 
-    Run again, the same command continues where it stopped. Ctrl-C saves and stops; a second Ctrl-C stops at once.
+    Run again, the same command continues where it stopped. Ctrl-C saves and stops; a second Ctrl-C stops at once. Exits
+    with 1 where a pair is damaged, and leaves it out.
     """
     from droguekit.workflows.detection import TrainingOptions, train_detector, training_lines
 
@@ -148,8 +153,10 @@ def train(
         "threads": threads,
     }
     options = TrainingOptions(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
-    for line in training_lines(train_detector(options, out, progress_report())):
+    result = train_detector(options, out, progress_report())
+    for line in training_lines(result):
         typer.echo(line)
+    exit_with_fault(result.fault)
 
 
 DatasetOrNone = Annotated[
@@ -298,9 +305,7 @@ def navigate(
     for line in done.lines():
         typer.echo(line)
     typer.echo(f"wrote {out}")
-    if done.fault is not None:
-        typer.echo(f"droguekit: error: {done.fault}", err=True)
-        raise typer.Exit(FAULT)
+    exit_with_fault(done.fault)
 
 
 def benchmark(
@@ -333,7 +338,8 @@ def benchmark(
     """Compare pose estimates, or a detector's boxes, with the truth of a dataset.
 
     An imported dataset has no truth: its estimates are compared with their own measurements, and with boxes if any.
-    Exits with 1 where a detector fails in a pair, which then counts as without boxes.
+    Exits with 1 where a record is damaged, which is then left out, and where a detector fails in a pair, which then
+    counts as without boxes.
     """
     from droguekit.workflows.benchmarking import DetectionOptions, run_benchmarks
 
@@ -344,6 +350,4 @@ def benchmark(
     for path in (json_, html):
         if path is not None:
             typer.echo(f"wrote {path}")
-    if outcome.fault is not None:
-        typer.echo(f"droguekit: error: {outcome.fault}", err=True)
-        raise typer.Exit(FAULT)
+    exit_with_fault(outcome.fault)

@@ -15,6 +15,7 @@ from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, BlindIndex, read_blind_index
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import read_sought_drogue
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
@@ -85,32 +86,46 @@ class BlindScene(NamedTuple):
     boxes: Mapping[Eye, PixelBox]
 
 
-def check_blind(dataset: Location, estimates: Path) -> BlindCheck:
+def check_blind(dataset: Location, estimates: Path, faults: PairFaults | None = None) -> BlindCheck:
     """Check every method of a file of estimates on a dataset without truth.
+
+    Args:
+        dataset: the dataset's folder.
+        estimates: of any number of methods.
+        faults: count damaged pairs, which are left out; without, such a pair is an error.
 
     Raises:
         ValueError: the dataset or the file cannot be read, or names pairs that the dataset lacks.
     """
     index = read_blind_index(dataset)
     methods = estimates_by_method(read_estimates(estimates), index.frames, str(estimates))
-    scenes = blind_scenes(dataset, index)
+    scenes = blind_scenes(dataset, index, faults)
     return BlindCheck(
         dataset=BlindFacts(name=index.name, pairs=len(index.frames)),
         code_version=version("droguekit"),
-        methods={name: _row(found, scenes) for name, found in methods.items()},
+        methods={
+            name: _row({i: estimate for i, estimate in found.items() if i in scenes}, scenes)
+            for name, found in methods.items()
+        },
     )
 
 
-def blind_scenes(dataset: Location, index: BlindIndex) -> dict[int, BlindScene]:
-    """The known data of each pair.
+def blind_scenes(dataset: Location, index: BlindIndex, faults: PairFaults | None = None) -> dict[int, BlindScene]:
+    """The known data of each pair; of whole ones only where `faults` counts the others.
 
     Raises:
         ValueError: a pair or the boxes cannot be read; names the file.
     """
     boxes, frames = _read_boxes(dataset), FrameStore(dataset)
+
+    def sought(frame: int) -> DrogueParameters:
+        return read_sought_drogue(frames, frame, index.drogue) if index.drogues_differ else index.drogue
+
     scenes = {}
     for frame in index.frames:
-        drogue = read_sought_drogue(frames, frame, index.drogue) if index.drogues_differ else index.drogue
+        drogue = read_or_note(frame, sought, faults)
+        if drogue is None:
+            continue
         given = {eye: boxes[2 * frame + view + 1] for view, eye in enumerate(EYES) if 2 * frame + view + 1 in boxes}
         scenes[frame] = BlindScene(index.rig, drogue, given)
     return scenes
@@ -209,7 +224,9 @@ def row_cells(check: BlindCheck, method: str) -> list[str]:
     ]
 
 
-def write_blind_report(dataset: Location, estimates: Path, check: BlindCheck, out_html: Path) -> None:
+def write_blind_report(
+    dataset: Location, estimates: Path, check: BlindCheck, out_html: Path, faults: PairFaults | None = None
+) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Raises:
@@ -223,15 +240,15 @@ def write_blind_report(dataset: Location, estimates: Path, check: BlindCheck, ou
         check=check,
         table=Table("methods", "", list(COLUMNS), [RowGroup("", rows)], first=None),
         shown_method=shown_method,
-        tiles=_tiles(dataset, estimates, shown_method),
+        tiles=_tiles(dataset, estimates, shown_method, faults),
     )
     write_text_atomic(out_html, page)
 
 
-def _tiles(dataset: Location, estimates: Path, method: str) -> list[tuple[Tile, str]]:
+def _tiles(dataset: Location, estimates: Path, method: str, faults: PairFaults | None) -> list[tuple[Tile, str]]:
     """Left images of some pairs with the pose of a method drawn in, and their captions."""
     index, source = read_blind_index(dataset), BlindDataset(dataset)
-    scenes = blind_scenes(dataset, index)
+    scenes = blind_scenes(dataset, index, faults)
     poses = {
         e.frame_index: e.left_from_drogue
         for e in read_estimates(estimates)
@@ -240,6 +257,9 @@ def _tiles(dataset: Location, estimates: Path, method: str) -> list[tuple[Tile, 
     frames = [index.frames[place] for place in evenly_spaced(len(index.frames), _MOST_TILES)]
     tiles = []
     for frame in frames:
+        pair = read_or_note(frame, source.pair, faults)
+        if pair is None or frame not in scenes:
+            continue
         scene, pose = scenes[frame], poses.get(frame)
         box = scene.boxes.get("left")
         centers: list[tuple[float, float]] = []
@@ -249,6 +269,6 @@ def _tiles(dataset: Location, estimates: Path, method: str) -> list[tuple[Tile, 
             centers = [(float(x), float(y)) for x, y in marker_images_px(scene, pose, "left")]
             distance_m = float(pose.translation_m[2])
             caption = f"Frame {frame}, {plain_number(distance_m)} m"
-        picture = label_picture(display_picture(source.pair(frame).images), box, centers)
+        picture = label_picture(display_picture(pair.images), box, centers)
         tiles.append((tile_of(frame, distance_m, picture), caption))
     return tiles

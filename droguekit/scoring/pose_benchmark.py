@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
@@ -44,22 +45,27 @@ Methods = Mapping[str, Mapping[int, Estimate]]
 Truths = Mapping[int, DrogueTruth | None]
 
 
-def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
+def run_benchmark(dataset: Location, estimates: Path, faults: PairFaults | None = None) -> BenchmarkResult:
     """Score every method of a file of estimates on a dataset.
 
     Args:
         dataset: the dataset's folder.
         estimates: a JSON-lines file, whoever wrote it. A pair without an estimate of a method counts as not fixed.
+        faults: count pairs whose record is damaged, which are then left out; without, such a pair is an error.
 
     Raises:
         ValueError: the dataset or the file cannot be read, the file is empty, names pairs that the dataset lacks, or
             names one twice for a method.
     """
-    return score_estimates(Dataset(dataset), read_estimates(estimates), str(estimates))
+    return score_estimates(Dataset(dataset), read_estimates(estimates), str(estimates), faults=faults)
 
 
 def score_estimates(
-    data: Dataset, estimates: Iterable[Estimate], source: str, frame_indices: Sequence[int] | None = None
+    data: Dataset,
+    estimates: Iterable[Estimate],
+    source: str,
+    frame_indices: Sequence[int] | None = None,
+    faults: PairFaults | None = None,
 ) -> BenchmarkResult:
     """Score every method of these estimates.
 
@@ -68,6 +74,7 @@ def score_estimates(
         estimates: of any number of methods. A pair without an estimate of a method counts as not fixed.
         source: what to call the estimates in errors.
         frame_indices: pairs to score on; all of the dataset when None.
+        faults: as for `run_benchmark`.
 
     Raises:
         ValueError: a record cannot be read, there are no estimates, or they name other pairs than these or one of them
@@ -77,10 +84,12 @@ def score_estimates(
     methods = estimates_by_method(estimates, indices, source)
     truths, states = {}, []
     for index in indices:
-        record = data.record(index)
+        record = read_or_note(index, data.record, faults)
+        if record is None:
+            continue
         truths[index] = drogue_truth(record)
         states.append(true_state(record))
-    facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(indices))
+    facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(truths))
     return score_methods(facts, truths, methods, true_sequences(states))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.storage import Location, open_storage
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class BenchmarkOutcome:
 
     Attributes:
         lines: of the result.
-        fault: pairs in which a detector failed, as one line; None for nothing.
+        fault: pairs that are damaged or in which a detector failed, as one line; None for nothing.
     """
 
     lines: Iterator[str]
@@ -81,9 +82,12 @@ def run_benchmarks(
         return BenchmarkOutcome(detector_lines(result), fault)
     if options.split is not None or options.threshold is not None:
         raise ValueError("--split, --threshold: are for detections, not for estimates")
+    faults = PairFaults()
     if open_storage(dataset).exists(BLIND_FILE):
-        return BenchmarkOutcome(_blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out)))
-    return BenchmarkOutcome(_error_lines(benchmark_dataset(dataset, estimates, json_out, html_out)))
+        check = check_blind_dataset(dataset, estimates, json_out, html_out, faults)
+        return BenchmarkOutcome(_blind_lines(check), faults.line())
+    result = benchmark_dataset(dataset, estimates, json_out, html_out, faults)
+    return BenchmarkOutcome(_error_lines(result), faults.line())
 
 
 def _error_lines(result: BenchmarkResult) -> Iterator[str]:
@@ -105,7 +109,11 @@ def _blind_lines(check: BlindCheck) -> Iterator[str]:
 
 
 def benchmark_dataset(
-    dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None
+    dataset: Location,
+    estimates: Path,
+    json_out: Path | None,
+    html_out: Path | None,
+    faults: PairFaults | None = None,
 ) -> BenchmarkResult:
     """Compare estimates with the truth, and write numbers and report where files are given.
 
@@ -119,15 +127,21 @@ def benchmark_dataset(
     from droguekit.scoring.report.pose_report import write_report
 
     with one_thread():
-        result = run_benchmark(dataset, estimates)
+        result = run_benchmark(dataset, estimates, faults)
         if json_out is not None:
             write_text_atomic(json_out, result.to_json())
         if html_out is not None:
-            write_report(dataset, estimates, result, html_out)
+            write_report(dataset, estimates, result, html_out, faults)
     return result
 
 
-def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None) -> BlindCheck:
+def check_blind_dataset(
+    dataset: Location,
+    estimates: Path,
+    json_out: Path | None,
+    html_out: Path | None,
+    faults: PairFaults | None = None,
+) -> BlindCheck:
     """Without truth, compare estimates with their own measurements, and with boxes if there are any.
 
     Raises:
@@ -139,11 +153,11 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
     from droguekit.scoring.blind_check import check_blind, write_blind_report
 
     with one_thread():
-        check = check_blind(dataset, estimates)
+        check = check_blind(dataset, estimates, faults)
         if json_out is not None:
             write_text_atomic(json_out, check.to_json())
         if html_out is not None:
-            write_blind_report(dataset, estimates, check, html_out)
+            write_blind_report(dataset, estimates, check, html_out, faults)
     return check
 
 
@@ -166,7 +180,8 @@ def benchmark_detections(
 
     if options.threshold is not None and not 0 <= options.threshold <= 1:
         raise ValueError(f"--threshold: must be from 0 to 1, got {options.threshold:g}")
-    truth = read_detection_truth(dataset)
+    faults = PairFaults()
+    truth = read_detection_truth(dataset, faults)
     # Errors are found before a detector runs.
     split = split_to_score(truth.images, options.split)
     runs, fault = _runs(dataset, options, report)
@@ -174,8 +189,8 @@ def benchmark_detections(
     if json_out is not None:
         write_text_atomic(json_out, scored.result.to_json())
     if html_out is not None:
-        write_detection_report(dataset, scored, html_out)
-    return scored.result, fault
+        write_detection_report(dataset, scored, html_out, faults)
+    return scored.result, faults.line() or fault
 
 
 def _runs(

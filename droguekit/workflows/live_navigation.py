@@ -14,6 +14,7 @@ from time import monotonic
 from types import FrameType
 from typing import TYPE_CHECKING, Literal, cast
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from droguekit.workflows.estimate_file import EstimateFile
 from droguekit.workflows.importing import _UNITS_M, ImportOptions
 from droguekit.workflows.navigation import (
@@ -26,7 +27,6 @@ from droguekit.workflows.navigation import (
     sequence_settings,
     tallied,
 )
-from nav.pair_measurement import PairFaults
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from droguekit.workflows.estimate_file import EstimateFile
-from nav.pair_measurement import PairFaults
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.blind import BlindDataset

@@ -214,7 +214,7 @@ def _predict(recipe: Recipe, scene: _Scene, light: str, distance_m: float) -> Ma
     from drogue_models.marker_layout import marker_layout
     from droguekit.scoring.poses.cramer_rao import FeatureNoise, features_seen, pose_bound
     from geometry.se3 import RigidTransform
-    from nav.centroids.small_centroids import smallest_gap_m
+    from nav.centroids.binary_centroids import smallest_gap_m
 
     layout, rig = marker_layout(recipe.drogue), recipe.rig
     scale = rig.camera.fx_px / distance_m

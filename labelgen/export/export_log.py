@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
 from datasets_manifest.storage.layout import RECORD_FILE
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 
 if TYPE_CHECKING:
     # The command's help lists the formats without loading what reads a dataset.
@@ -42,29 +43,49 @@ class ExportLog:
 
     Attributes:
         remarks: what whoever reads the export has to know and the format cannot say, a line each.
+        faults: count damaged pairs, which are left out; None where such a pair is an error.
     """
 
-    def __init__(self, progress: Progress | None = None) -> None:
+    def __init__(self, progress: Progress | None = None, faults: PairFaults | None = None) -> None:
         self._progress = progress
         self._losses: Counter[str] = Counter()
         self.remarks: list[str] = []
+        self.faults = faults
 
-    def records(self, source: Dataset) -> Iterator[PairRecord]:
+    def records(self, source: Dataset, with_files: bool = True) -> Iterator[PairRecord]:
         """The records of all pairs in the order of their indices, one at a time.
 
+        Where `faults` counts damaged pairs, all files of a pair are checked before it is given: a format's files are
+        written pair by pair, and half a pair would be worse than none.
+
+        Args:
+            source: the dataset.
+            with_files: whether the export reads more of a pair than its record.
+
         Raises:
-            ValueError: a record that cannot be read or contradicts itself; names the file.
+            ValueError: a record that cannot be read or contradicts itself, and nothing counts faults, or no pair is
+                whole; names the file.
         """
-        if self._progress is not None:
-            self._progress.begin("pairs", len(source.frame_indices))
-        for frame_index in source.frame_indices:
-            record = source.record(frame_index)
+
+        def read(frame_index: int) -> PairRecord:
+            is_checked = with_files and self.faults is not None
+            record = source.checked_record(frame_index) if is_checked else source.record(frame_index)
             fault = record_fault(record)
             if fault is not None:
                 raise ValueError(f"{source.frames.where(frame_index, RECORD_FILE)}: {fault}")
-            yield record
+            return record
+
+        if self._progress is not None:
+            self._progress.begin("pairs", len(source.frame_indices))
+        for frame_index in source.frame_indices:
+            record = read_or_note(frame_index, read, self.faults)
+            if record is not None:
+                yield record
             if self._progress is not None:
                 self._progress.advance()
+        first = None if self.faults is None else self.faults.first
+        if first is not None and self.faults is not None and self.faults.count == len(source.frame_indices):
+            raise ValueError(first[1])
 
     def end(self) -> None:
         """End the progress display, after success or failure."""

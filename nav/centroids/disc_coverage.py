@@ -19,6 +19,8 @@ from nav.numerics.compiled import compiled
 # Beyond four standard deviations a Gaussian holds less than 1e-4 of the light.
 _REACH_SIGMA = 4.0
 _LEAST_SIGMA_PX = 0.05
+# Lines that are less slanted count as this slanted.
+_LEAST_SLANT = 1e-3
 # For the derivative by the spread.
 _STEP_PX = 1e-3
 
@@ -113,6 +115,55 @@ def spread_discs(centers_px: Array, radii_px: Array, sigma_px: Array, half: int,
         -pixels(by_y, spread, spread),
         pixels(area, broader, spread) + pixels(area, spread, broader),
     )
+
+
+def spread_ring_shares(
+    middles_px: Array, maps: Array, edges: tuple[float, float], sigma_px: float, half: int, cells: int
+) -> Array:
+    """(N, 2, W, W) shares of each pixel's light from within the inner edge and from beyond the outer edge of a ring.
+
+    Args:
+        middles_px: (N, 2) the ring's middle from the middles of the windows.
+        maps: (N, 2, 2) from the ring's plane to pixels.
+        edges: inner and outer radius in the ring's plane.
+        sigma_px, half, cells: as in `spread_discs`; all windows have one spread.
+    """
+    size, sigma = 2 * half + 1, max(sigma_px, _LEAST_SIGMA_PX)
+    reach = int(np.ceil(_REACH_SIGMA * sigma * cells)) + 1
+    places = np.arange(size * cells + 2 * reach) - reach
+    # Whole pixels are too wide to take an edge in them as straight.
+    parts = 2 if cells == 1 else 1
+    at = (np.arange(len(places) * parts) + 0.5) / (cells * parts) - reach / cells - half - 0.5
+    x, y = at - middles_px[:, :1, None], at[:, None] - middles_px[:, 1:, None]
+    inverse = np.linalg.inv(maps)[..., None, None]
+    u, v = inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 1, 0] * x + inverse[:, 1, 1] * y
+    radius = np.maximum(np.hypot(u, v), 1e-9)
+    by_x, by_y = (inverse[:, 0, k] * u / radius + inverse[:, 1, k] * v / radius for k in (0, 1))
+    slope = np.hypot(by_x, by_y)
+    wide, narrow = np.maximum(np.abs(by_x), np.abs(by_y)) / slope, np.minimum(np.abs(by_x), np.abs(by_y)) / slope
+    spread = _spread(places, size, cells, np.array([sigma]))[0]
+
+    def picture(edge: float) -> Array:
+        inside = _below_line((edge - radius) / slope * (cells * parts), wide, np.maximum(narrow, _LEAST_SLANT))
+        joined = inside.reshape(len(inside), len(places), parts, len(places), parts).mean(axis=(2, 4))
+        light: Array = spread @ joined @ spread.T / cells**2
+        return light
+
+    return np.stack([picture(edges[0]), 1 - picture(edges[1])], axis=1)
+
+
+def _below_line(distance: Array, wide: Array, narrow: Array) -> Array:
+    """Share of a unit square on one side of a line at a distance from its middle: the sum of two uniform variables.
+
+    Args:
+        distance: towards the line, below zero where the middle is beyond it.
+        wide, narrow: larger and smaller component of the line's unit normal, both above zero.
+    """
+    total = 0.0
+    for sign, end in ((1, wide + narrow), (-1, wide - narrow), (-1, narrow - wide), (1, -wide - narrow)):
+        total = total + sign * np.maximum(distance + end / 2, 0) ** 2 / 2
+    share: Array = total / (wide * narrow)
+    return share
 
 
 def _spread(places: NDArray[np.int64], size: int, cells: int, sigma_px: Array) -> Array:

@@ -91,6 +91,32 @@ class FaceBackground:
         """Those of some discs."""
         return replace(self, places_m=self.places_m[index])
 
+    def maps_px(self, eyes: NDArray[np.int64], centers_px: Array, variances_px2: Array | None = None) -> Array | None:
+        """(M, 2, 3) affine map from the rim plane [m] to pixels by the markers of each one's own eye.
+
+        Args:
+            eyes: (M,) of the markers.
+            centers_px: (M, 2) where they are.
+            variances_px2: (M, 2) of these; all count alike when None.
+
+        Returns:
+            None where an eye has too few markers for a map.
+        """
+        maps = np.empty((len(eyes), 2, 3))
+        for eye in np.unique(eyes):
+            mine = np.flatnonzero(eyes == eye)
+            if len(mine) < _LEAST_MARKERS:
+                return None
+            design = np.column_stack([self.places_m[mine], np.ones(len(mine))])
+            if variances_px2 is None:
+                maps[mine] = np.linalg.lstsq(design, centers_px[mine], rcond=None)[0].T
+                continue
+            for axis in (0, 1):
+                root = 1 / np.sqrt(variances_px2[mine, axis])
+                weighted = root * centers_px[mine, axis]
+                maps[mine, axis] = np.linalg.lstsq(design * root[:, None], weighted, rcond=None)[0]
+        return None if (np.abs(np.linalg.det(maps[..., :2])) < np.finfo(float).eps).any() else maps
+
 
 def visible_margin_px(signal: MarkerSignal) -> float:
     """Margin around a disc within which light from beyond the face reaches its window. [px]"""
@@ -150,21 +176,13 @@ def background_shares(
     Returns:
         (N, 2, K), or None where an eye has too few markers for the map.
     """
-    count = len(discs)
-    middles, shapes = np.empty((count, 2)), np.empty((2, count, 2, 2))
-    for eye in np.unique(discs.eyes):
-        mine = np.flatnonzero(discs.eyes == eye)
-        if len(mine) < _LEAST_MARKERS:
-            return None
-        design = np.column_stack([face.places_m[mine], np.ones(len(mine))])
-        affine = np.linalg.lstsq(design, discs.centers_px[mine], rcond=None)[0].T
-        if abs(np.linalg.det(affine[:, :2])) < np.finfo(float).eps:
-            return None
-        middles[mine] = discs.centers_px[mine] - face.places_m[mine] @ affine[:, :2].T - pixels.origins_px[mine]
-        shape = plane_shapes(affine[None, :, :2])[0]
-        nearer_m = nearer_px / np.sqrt(np.linalg.det(shape))
-        edges_m = face.edges_m[0] + nearer_m, face.edges_m[1] - nearer_m
-        shapes[:, mine] = np.multiply.outer(edges_m, shape)[:, None]
+    maps = face.maps_px(discs.eyes, discs.centers_px)
+    if maps is None:
+        return None
+    middles = discs.centers_px - np.einsum("nij,nj->ni", maps[..., :2], face.places_m) - pixels.origins_px
+    shape = plane_shapes(maps[..., :2])
+    nearer_m = nearer_px / np.sqrt(np.linalg.det(shape))[:, None, None]
+    shapes = np.stack([(face.edges_m[0] + nearer_m) * shape, (face.edges_m[1] - nearer_m) * shape])
     x = pixels.x_px - middles[:, :1].astype(np.float32)
     y = pixels.y_px - middles[:, 1:].astype(np.float32)
     in_opening = 1 - blurred_share_outside(shapes[0], x, y, width_px, motions)

@@ -19,11 +19,10 @@ from datasets_manifest.types.images import StereoImages
 from geometry.se3 import Array
 from geometry.stereo import EYES
 from nav.centroids.centroid_uncertainty import NoiseModel, widen_for_nonlinearity
-from nav.centroids.disc_coverage import SpreadDiscs, spread_discs
+from nav.centroids.disc_coverage import SpreadDiscs, spread_discs, spread_ring_shares
 from nav.centroids.discs import DiscFits
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.face_background import FaceBackground, background_shares
-from nav.centroids.outline_pixels import OutlinePixels
+from nav.centroids.face_background import FaceBackground
 from nav.centroids.pixel_response import reduced_equations
 from nav.matching.marker_channel import linear_light
 from nav.numerics.compiled import Array32
@@ -44,6 +43,10 @@ _CELLS = (4, 1)
 # Where a disc lies within one pixel of a sensor that spreads light afterwards, its image does not change with its
 # place, and only the pixel is known: the standard deviation of a place that may be anywhere in most of it. [px]
 _WITHIN_PIXEL_PX = 0.2
+# Lamps of one drogue differ by this share of their light, and so does the light beside them. So many are compared; one
+# with less of the usual light is hidden in part.
+_LAMPS_DIFFER, _FACES_DIFFER, _LEAST_SPREAD_DN = 0.03, 0.1, 1.0
+_LEAST_ALIKE, _LEAST_LIGHT = 4, 0.5
 # An own light of fewer standard deviations may be noise.
 _LEAST_STRENGTH = 4.0
 # Of a disc's light this share must lie in pixels that are used; clipped ones are not.
@@ -97,7 +100,8 @@ class _Fit:
     Attributes:
         minimum: parameters are the place from the window's middle, the light of each colour, and the light beside.
         sigma_px: of the spread.
-        weights: (N, K + 2) inverse variances, the last two of the place before the fit.
+        weights: (N, K + P) inverse variances, the last ones of the P parameters before the fit.
+        pixels: K.
         share: (N,) of the disc's light in samples that are used.
         loss: twice the negative logarithm of the evidence (Laplace's approximation), to choose the kind of spread by.
     """
@@ -105,6 +109,7 @@ class _Fit:
     minimum: Minimum
     sigma_px: float
     weights: Array32
+    pixels: int
     share: Array
     loss: float
 
@@ -140,7 +145,7 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
     )
     reasons = tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
     good = np.array([reason is None for reason in reasons], dtype=np.bool_)
-    background = parameters[:, 2 + colors]
+    background, used = parameters[:, 2 + colors], fit.weights[:, : fit.pixels]
     return DiscFits(
         ellipses=Ellipses(discs.eyes, np.where(good[:, None], centers, discs.centers_px), discs.shapes_px),
         cov_px2=center_cov,
@@ -150,13 +155,13 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
         chi2_per_dof=chi2,
         inflation=inflation,
         reasons=reasons,
-        noise=NoiseModel(float(1 / np.median(fit.weights[:, :-2][fit.weights[:, :-2] > 0])), 0.0, 0.0),
+        noise=NoiseModel(float(1 / np.median(used[used > 0])), 0.0, 0.0),
     )
 
 
 def _chi2(fit: _Fit) -> Array:
     """(N,) mean squares of the residuals over their variances."""
-    weights, residuals = fit.weights[:, :-2], fit.minimum.residuals[:, :-2]
+    weights, residuals = fit.weights[:, : fit.pixels], fit.minimum.residuals[:, : fit.pixels]
     freedom = np.maximum((weights > 0).sum(axis=1) - fit.minimum.parameters.shape[1], 1)
     mean: Array = (weights * residuals**2).sum(axis=1) / freedom
     return mean
@@ -202,58 +207,140 @@ def _by_color(pixels: NDArray[Any]) -> NDArray[Any]:
 def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells: int) -> _Fit:
     """Fit all discs by one kind of spread; its width, neighbours' light and the noise follow from the fits before."""
     centers, sigma_px, variances = discs.centers_px, _FIRST_SIGMA_PX, np.ones_like(windows.values)
-    beside = np.zeros_like(windows.values)
+    beside, common, cov = np.zeros_like(windows.values), None, None
+    size = windows.values.shape[1]
     for turn in range(_TURNS):
-        basis, chosen = _background_basis(windows, discs, centers, face, sigma_px)
-        prior = np.full((len(discs), 2), _WITHIN_PIXEL_PX**-2, np.float32)
-        weights = np.concatenate([windows.present * chosen / variances, prior], axis=1)
+        basis, chosen = _background_basis(windows, discs, centers, face, (sigma_px, cells))
         model = _disc_model(windows, discs.radii_px, basis, (sigma_px, cells))
+        places = _likely_places(discs, centers, cov, face) - windows.middles_px
         count = windows.classes.shape[1] * (1 + basis.shape[1])
-        places, light = centers - windows.middles_px, windows.values - beside
+        prior = (
+            _Prior(places, *(np.zeros((len(discs), count)),) * 2)
+            if common is None
+            else replace(common, places_px=places)
+        )
+        weights = np.concatenate([windows.present * chosen / variances, prior.weights], axis=1)
+        light = windows.values - beside
+        data, start = np.concatenate([light, prior.means], axis=1), prior.places_px
         if cells == 1 and turn > 0 and discs.radii_px.min() < _FLAT_RADIUS_PX:
-            places = _best_places(model, light, weights, places, count)
-        start = _with_light(model, light, weights, places, count)
-        data = np.concatenate([light, places.astype(np.float32)], axis=1)
-        minimum = minimise(model, data, weights, start, _STEPS, _SMALL_STEP_PX)
+            start = _best_places(model, data, weights, prior)
+        minimum = minimise(
+            model, data, weights, _with_light(model, data, weights, start, count), _STEPS, _SMALL_STEP_PX
+        )
         if turn == _TURNS - 1:
             break
-        kept = np.abs(minimum.parameters[:, :2] - places).max(axis=1) < _LARGEST_MOVE_PX
+        kept = np.abs(minimum.parameters[:, :2] - prior.places_px).max(axis=1) < _LARGEST_MOVE_PX
         centers = np.where(kept[:, None], windows.middles_px + minimum.parameters[:, :2], discs.centers_px)
+        cov = minimum.covariance()[:, :2, :2] if turn else None
         variances = _variances(windows, minimum, weights)
         sigma_px = _common_sigma(windows, discs.radii_px, minimum, weights, (sigma_px, cells))
         beside = _light_of_neighbours(windows, discs, minimum, (sigma_px, cells))
-    used = weights[:, :-2]
-    misfit = float((used * minimum.residuals[:, :-2] ** 2).sum() - np.log(used[used > 0]).sum())
+        squares, counted = weights[:, :size] * minimum.residuals[:, :size] ** 2, (weights[:, :size] > 0).sum(axis=1)
+        misfit = squares.sum(axis=1) / np.maximum(counted, 1)
+        common = _common_amounts(discs, minimum, prior, misfit, (face is not None, windows.classes.shape[1]))
+    used = weights[:, :size]
+    misfit = float((used * minimum.residuals[:, :size] ** 2).sum() - np.log(used[used > 0]).sum())
     # A spread by which all discs would happen to lie at the middles of pixels is less likely than one that leaves their
     # places open.
     loss = misfit - float(np.log(np.linalg.det(minimum.covariance()[:, :2, :2])).sum())
     light = windows.samples(_pictures(windows, discs.radii_px, minimum.parameters, (sigma_px, cells)).light)
     share = (light * (used > 0)).sum(axis=1) / light.sum(axis=1)
-    return _Fit(minimum, sigma_px, weights, share, loss)
+    return _Fit(minimum, sigma_px, weights, size, share, loss)
 
 
-def _with_light(model: Model, light: Array32, weights: Array32, places_px: Array, count: int) -> Minimum:
-    """Discs at given places (N, 2) with the light of `count` amounts that fits best."""
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """What is known of discs before their fit.
+
+    Attributes:
+        places_px: (N, 2) within `_WITHIN_PIXEL_PX`.
+        amounts: (N, A) of light.
+        information: (N, A) inverse variances of these, 0 where nothing is known.
+    """
+
+    places_px: Array
+    amounts: Array
+    information: Array
+
+    @property
+    def means(self) -> Array32:
+        """(N, P) the likeliest parameters."""
+        return np.concatenate([self.places_px, self.amounts], axis=1).astype(np.float32)
+
+    @property
+    def weights(self) -> Array32:
+        """(N, P) inverse variances of the parameters."""
+        place = np.full_like(self.places_px, _WITHIN_PIXEL_PX**-2)
+        return np.concatenate([place, self.information], axis=1).astype(np.float32)
+
+
+def _common_amounts(discs: Ellipses, minimum: Minimum, prior: _Prior, misfit: Array, kind: tuple[bool, int]) -> _Prior:
+    """The light of all discs of an eye, and that of the face and beyond it, as known for each of them.
+
+    All lamps of a drogue are alike. Whether a small one is bright or lies on fewer pixels shows in its own picture only
+    weakly; in those of all it does. A lamp that is clearly darker is hidden, in part at least, and not like the others.
+
+    Args:
+        discs: of both eyes.
+        minimum: of their fits.
+        prior: of these.
+        misfit: (N,) mean squares of the residuals over the variances that the fits were given.
+        kind: whether they lie on a face, and the number of colours.
+    """
+    on_face, colors = kind
+    amounts, information = prior.amounts.copy(), np.zeros_like(prior.information)
+    shared = np.arange(prior.amounts.shape[1] if on_face else colors)
+    spread = np.where(shared < colors, _LAMPS_DIFFER, _FACES_DIFFER)
+    for eye in np.unique(discs.eyes):
+        mine = np.flatnonzero(discs.eyes == eye)
+        if len(mine) < _LEAST_ALIKE:
+            continue
+        found = minimum.parameters[mine][:, 2 + shared]
+        known = np.zeros((len(mine), len(shared), len(shared)))
+        known[:, range(len(shared)), range(len(shared))] = prior.information[mine][:, shared]
+        own = np.linalg.inv(minimum.covariance()[mine][:, 2 + shared[:, None], 2 + shared])
+        weighted = np.einsum("nij,nj->ni", own, found) - np.einsum("nij,nj->ni", known, prior.amounts[mine][:, shared])
+        middle = np.median(found[:, :colors], axis=0)
+        variance = np.einsum("nii->ni", minimum.covariance()[mine][:, 2 : 2 + colors, 2 : 2 + colors])
+        deviation = np.sqrt(variance * misfit[mine, None])
+        alike = (found[:, :colors] + 2 * deviation > _LEAST_LIGHT * middle).all(axis=1)
+        if alike.sum() < _LEAST_ALIKE:
+            continue
+        mean = np.linalg.solve((own - known)[alike].sum(axis=0), weighted[alike].sum(axis=0))
+        same = mine[alike]
+        amounts[same[:, None], shared] = mean
+        information[same[:, None], shared] = (spread * np.maximum(np.abs(mean), _LEAST_SPREAD_DN / spread)) ** -2
+    return replace(prior, amounts=amounts, information=information)
+
+
+def _likely_places(discs: Ellipses, centers_px: Array, cov_px2: Array | None, face: FaceBackground | None) -> Array:
+    """(N, 2) places before the next fit: where they are, or for discs that may lie within a pixel, by all of an eye."""
+    if face is None or cov_px2 is None or discs.radii_px.max() >= _FLAT_RADIUS_PX:
+        return centers_px
+    maps = face.maps_px(discs.eyes, centers_px, np.einsum("nii->ni", cov_px2))
+    if maps is None:
+        return centers_px
+    places: Array = np.einsum("nij,nj->ni", maps[..., :2], face.places_m) + maps[..., 2]
+    return places
+
+
+def _with_light(model: Model, data: Array32, weights: Array32, places_px: Array, count: int) -> Minimum:
+    """Discs at given places (N, 2) with the `count` amounts of light that fit best."""
     start = np.concatenate([places_px, np.zeros((len(places_px), count))], axis=1)
-    data = np.concatenate([light, places_px.astype(np.float32)], axis=1)
     # Without light nothing depends on the place, so the first step is that of the light alone.
     return minimise(model, data, weights, evaluate(model, data, weights, start), 1, np.inf)
 
 
-def _best_places(model: Model, light: Array32, weights: Array32, places_px: Array, count: int) -> Array:
-    """(N, 2) the means of the places on a grid about the given ones, by their likelihood.
+def _best_places(model: Model, data: Array32, weights: Array32, prior: _Prior) -> Array:
+    """(N, 2) the means of the places on a grid about the prior's, by their likelihood.
 
     The image of a disc that lies within one pixel does not show in which direction a better place lies.
     """
     offsets = np.stack(np.meshgrid(_GRID_PX, _GRID_PX), axis=-1).reshape(-1, 2)
-    misfits = np.stack(
-        [
-            (_with_light(model, light, weights, places_px + offset, count).residuals ** 2 * weights).sum(axis=1)
-            for offset in offsets
-        ]
-    )
+    fits = (_with_light(model, data, weights, prior.places_px + offset, prior.amounts.shape[1]) for offset in offsets)
+    misfits = np.stack([(fit.residuals**2 * weights).sum(axis=1) for fit in fits])
     likelihood = np.exp((misfits.min(axis=0) - misfits) / 2)
-    means: Array = places_px + likelihood.T @ offsets / likelihood.sum(axis=0)[:, None]
+    means: Array = prior.places_px + likelihood.T @ offsets / likelihood.sum(axis=0)[:, None]
     return means
 
 
@@ -264,7 +351,7 @@ def _pictures(windows: _Windows, radii_px: Array, parameters: Array, spread: tup
 
 
 def _disc_model(windows: _Windows, radii_px: Array, basis: Array32, spread: tuple[float, int]) -> Model:
-    """The picture of discs, and last their place, which is known to a pixel before the fit."""
+    """The picture of discs, and last their parameters, of which some is known before the fit."""
     classes = windows.classes
     count, colors, size = classes.shape
     backgrounds = (classes[:, :, None] * basis[:, None]).reshape(count, -1, size)
@@ -275,38 +362,32 @@ def _disc_model(windows: _Windows, radii_px: Array, basis: Array32, spread: tupl
         linear = np.concatenate([classes * light[:, None], backgrounds], axis=1)
         amounts = parameters[:, 2:].astype(np.float32)
         level = np.einsum("nc,nck->nk", amounts[:, :colors], classes)
-        jacobian = np.zeros((count, parameters.shape[1], size + 2), np.float32)
-        jacobian[:, 0, :-2], jacobian[:, 1, :-2], jacobian[:, 2:, :-2] = level * by_x, level * by_y, linear
-        jacobian[:, 0, -2] = jacobian[:, 1, -1] = 1
+        own = np.arange(parameters.shape[1])
+        jacobian = np.zeros((count, len(own), size + len(own)), np.float32)
+        jacobian[:, 0, :size], jacobian[:, 1, :size], jacobian[:, 2:, :size] = level * by_x, level * by_y, linear
+        jacobian[:, own, size + own] = 1
         picture = np.einsum("np,npk->nk", amounts, linear)
-        return np.concatenate([picture, parameters[:, :2].astype(np.float32)], axis=1), jacobian
+        return np.concatenate([picture, parameters.astype(np.float32)], axis=1), jacobian
 
     return model
 
 
 def _background_basis(
-    windows: _Windows, discs: Ellipses, centers_px: Array, face: FaceBackground | None, sigma_px: float
+    windows: _Windows, discs: Ellipses, centers_px: Array, face: FaceBackground | None, spread: tuple[float, int]
 ) -> tuple[Array32, Array32]:
     """(N, B, K) pictures of the light beside the discs, and (N, K) 1 for the samples that they describe."""
     constant = np.ones_like(windows.values)[:, None]
-    shares = None
-    if face is not None:
-        nothing = np.zeros_like(windows.values)
-        pixels = OutlinePixels(
-            x_px=windows.x_px,
-            y_px=windows.y_px,
-            values=nothing,
-            present=windows.present,
-            clipped=nothing > 0,
-            origins_px=windows.middles_px,
-            truncated=np.zeros(len(discs), np.bool_),
-        )
-        placed = Ellipses(discs.eyes, centers_px, discs.shapes_px)
-        shares = background_shares(face, placed, pixels, float(np.hypot(sigma_px, np.sqrt(1 / 12))), None)
-    if shares is None:
+    maps = None if face is None else face.maps_px(discs.eyes, centers_px)
+    if face is None or maps is None:
         half = np.float32(windows.half)
         slopes = np.stack([windows.x_px / half, windows.y_px / half], axis=1)
         return np.concatenate([constant, slopes], axis=1), np.ones_like(windows.values)
+    # Each disc lies where it was found: perspective moves the rim against a marker by hundredths of a pixel. Those that
+    # may lie within one pixel are placed worse than by the map of all of them.
+    moved = centers_px - np.einsum("nij,nj->ni", maps[..., :2], face.places_m)
+    middles = np.where((discs.radii_px < _FLAT_RADIUS_PX)[:, None], maps[..., 2], moved) - windows.middles_px
+    pictures = spread_ring_shares(middles, maps[..., :2], face.edges_m, spread[0], windows.half, spread[1])
+    shares = np.stack([windows.samples(pictures[:, edge]) for edge in (0, 1)], axis=1)
     near = np.hypot(windows.x_px, windows.y_px) < discs.radii_px[:, None] + _OWN_PX
     chosen = near | (shares.sum(axis=1) < _MOST_BEYOND)
     return np.concatenate([constant, shares], axis=1), chosen.astype(np.float32)
@@ -314,11 +395,12 @@ def _background_basis(
 
 def _variances(windows: _Windows, minimum: Minimum, weights: Array32) -> Array32:
     """(N, K) variances that grow with the light, by a robust line through the squared residuals. [DN^2]"""
-    residuals = minimum.residuals[:, :-2]
+    size = windows.values.shape[1]
+    residuals = minimum.residuals[:, :size]
     levels = windows.values - residuals
     # The brightest pixels of a small disc draw the fit towards them.
-    leverages = np.minimum(minimum.leverages(minimum.covariance(), weights)[:, :-2], _LARGEST_LEVERAGE)
-    used = weights[:, :-2] > 0
+    leverages = np.minimum(minimum.leverages(minimum.covariance(), weights)[:, :size], _LARGEST_LEVERAGE)
+    used = weights[:, :size] > 0
     squares = (residuals**2 / (1 - leverages))[used].astype(np.float64)
     light = np.maximum(levels[used], 0.0).astype(np.float64)
     dark, growth = max(float(np.median(squares)) / _MEDIAN_OF_SQUARES, _QUANTISATION_DN2), 0.0
@@ -340,7 +422,7 @@ def _common_sigma(
     pictures = _pictures(windows, radii_px, minimum.parameters, spread)
     colors = windows.classes.shape[1]
     level = np.einsum("nc,nck->nk", minimum.parameters[:, 2 : 2 + colors].astype(np.float32), windows.classes)
-    slope = np.pad(level * windows.samples(pictures.by_sigma), ((0, 0), (0, 2)))
+    slope = np.pad(level * windows.samples(pictures.by_sigma), ((0, 0), (0, minimum.parameters.shape[1])))
     normal, gradient = reduced_equations(minimum, slope[:, None], weights)
     known = normal[:, 0, 0] > 0
     step = float(gradient[known].sum() / max(normal[known].sum(), np.finfo(float).tiny))

@@ -43,11 +43,11 @@ def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DroguePar
         ValueError: an unknown name, or a file that is missing or not such a network; the message names it.
     """
     if name_or_file == COLOR_BLOB:
-        from nav.detector.color_blob import ColorBlobDetector
+        from nav.detector.ring_detectors import ColorBlobDetector
 
         return ColorBlobDetector
     if name_or_file == PEAK_RING:
-        from nav.detector.peak_ring import PeakRingDetector
+        from nav.detector.ring_detectors import PeakRingDetector
 
         return PeakRingDetector
     file = network_file(name_or_file)

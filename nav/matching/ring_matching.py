@@ -249,11 +249,12 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, 
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
     lean = np.zeros(2)
     fitted = None
-    for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
+    for tolerance in (_GUESS_TOLERANCE, _GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
         # Mostly the first guess already matches the right blobs, and the same blobs give the same map.
         if fitted is None or (blob_of_marker != fitted).any():
             fitted, hit = blob_of_marker, blob_of_marker >= 0
-            if hit.sum() < least:
+            # A guess ignores the tilt, which moves far markers of small radius out of its tolerance.
+            if hit.sum() < min(least, FEW):
                 return None
             seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
             solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)
@@ -264,6 +265,8 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, 
                 affine, lean = _fit_with_lean(layout.centers_m[hit], centers_px, affine)
         if tolerance is not None:
             blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance, lean)
+    if hit.sum() < least:
+        return None
     largest, smallest = _singular_values(affine)
     if _determinant(affine) <= 0 or smallest < _STRONGEST_TILT_COSINE * largest:
         return None

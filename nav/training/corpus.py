@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import PART_SUFFIX, new_folder, try_lock
 from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from drogue_models.frozen_model import FrozenModel
@@ -65,6 +66,7 @@ class _Index(FrozenModel):
     dataset_sha256: str
     size_px: SizePx
     pairs: tuple[CachedPair, ...]
+    damaged: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +76,22 @@ class ImageCache:
     Attributes:
         images: (P, 2, H, W, 3) left and right, gamma-encoded red, green, blue; memory-mapped.
         pairs: the labels of P pairs.
+        faults: of the other pairs, which are damaged.
     """
 
     images: NDArray[np.uint8]
     pairs: tuple[CachedPair, ...]
+    faults: PairFaults
 
 
 class _ReadPair(NamedTuple):
     images: list[NDArray[np.uint8]]
     entry: CachedPair
+
+
+class _DamagedPair(NamedTuple):
+    frame_index: int
+    fault: str
 
 
 def open_image_cache(
@@ -95,6 +104,8 @@ def open_image_cache(
 ) -> ImageCache:
     """Open a dataset's cache; if there is none, make it: decode every image, and check all hashes.
 
+    Damaged pairs are left out. Once one of them is whole again, the cache is made again.
+
     Args:
         dataset: with the images.
         folder: of all caches.
@@ -104,7 +115,7 @@ def open_image_cache(
         should_stop: called after each pair, and while waiting.
 
     Raises:
-        ValueError: a file of the dataset is missing, damaged or changed; the message names it.
+        ValueError: all pairs of the dataset are damaged; the message names a file.
         OSError: the cache cannot be written.
         KeyboardInterrupt: `should_stop` returned true.
     """
@@ -155,28 +166,53 @@ def _read(cache_folder: Path, dataset: Dataset, size_px: SizePx) -> ImageCache |
     wanted = (_VERSION, dataset.manifest.dataset_sha256, size_px)
     is_whole = images.shape == (len(index.pairs), 2, *size_px, 3) and images.dtype == np.uint8
     is_wanted = (index.version, index.dataset_sha256, index.size_px) == wanted
-    return ImageCache(images, index.pairs) if is_whole and is_wanted else None
+    if not (is_whole and is_wanted):
+        return None
+    faults = PairFaults()
+    for frame_index in index.damaged:
+        found = dataset.verify(frame_index)
+        if not found:
+            return None
+        faults.note(frame_index, found[0])
+    return ImageCache(images, index.pairs, faults)
 
 
 def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance: Callable[[], None]) -> None:
     splits = dataset.manifest.split_of_frame()
 
-    def read(frame_index: int) -> _ReadPair:
+    def read(frame_index: int) -> _ReadPair | _DamagedPair:
+        faults = dataset.verify(frame_index)
+        if faults:
+            return _DamagedPair(frame_index, faults[0])
         return _read_pair(dataset, frame_index, splits[frame_index], size_px)
 
     pairs: list[CachedPair] = []
+    damaged: list[_DamagedPair] = []
     with (part / _IMAGES_FILE).open("wb") as stream:
         _write_header(stream, (len(dataset.frame_indices), 2, *size_px, 3))
         for pair in prefetch_map(read, dataset.frame_indices, threads, 2 * threads):
+            if isinstance(pair, _DamagedPair):
+                damaged.append(pair)
+                advance()
+                continue
             # Written, not memory-mapped: a full disk raises an error here, but would kill the process there.
             for image in pair.images:
                 stream.write(np.ascontiguousarray(image).data)
             pairs.append(pair.entry)
             advance()
+        if not pairs:
+            raise ValueError(damaged[0].fault)
+        # The header has room for any number of pairs, and so its length stays.
+        stream.seek(0)
+        _write_header(stream, (len(pairs), 2, *size_px, 3))
         stream.flush()
         os.fsync(stream.fileno())
     index = _Index(
-        version=_VERSION, dataset_sha256=dataset.manifest.dataset_sha256, size_px=size_px, pairs=tuple(pairs)
+        version=_VERSION,
+        dataset_sha256=dataset.manifest.dataset_sha256,
+        size_px=size_px,
+        pairs=tuple(pairs),
+        damaged=tuple(each.frame_index for each in damaged),
     )
     (part / _INDEX_FILE).write_text(json.dumps(index.model_dump(mode="json")), encoding="utf-8")
 
@@ -187,9 +223,6 @@ def _write_header(stream: BinaryIO, shape: tuple[int, ...]) -> None:
 
 
 def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: SizePx) -> _ReadPair:
-    faults = dataset.verify(frame_index)
-    if faults:
-        raise ValueError(faults[0])
     record, stereo = dataset.record(frame_index), dataset.images(frame_index)
     images, boxes, others = [], [], []
     for eye in EYES:
@@ -221,12 +254,14 @@ class Corpus:
         size_px: (height, width) of the images.
         caches: one for each dataset.
         places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
+        fault: damaged pairs, which are left out, as one line; None for nothing.
     """
 
     datasets: tuple[DatasetStamp, ...]
     size_px: SizePx
     caches: tuple[ImageCache, ...]
     places: NDArray[np.int64]
+    fault: str | None = None
 
     def split(self, name: SplitName) -> NDArray[np.int64]:
         """(n,) indices of the pairs of a split."""
@@ -270,19 +305,23 @@ def open_corpus(
         should_stop: called after every pair.
 
     Raises:
-        ValueError: no datasets, one twice, a missing, damaged or changed file, no drogue, images of different sizes, or
+        ValueError: no datasets, one twice, one without a whole pair, no drogue, images of different sizes, or
             no split to train on; the message names the path.
         OSError: the cache cannot be written.
         KeyboardInterrupt: `should_stop` returned true.
     """
     datasets = _open_datasets(paths)
-    caches = []
+    caches: list[ImageCache] = []
+    fault: str | None = None
     for dataset in datasets:
         observer.begin(f"images of {dataset.path} at {size_text(size_px)}", len(dataset.frame_indices))
         try:
             caches.append(open_image_cache(dataset, cache, size_px, threads, observer, should_stop))
         finally:
             observer.end()
+        if (line := caches[-1].faults.line()) is not None:
+            fault = fault or f"{dataset.path}: {line}"
+            observer.say(f"{dataset.path}: {line}")
         if not any(box is not None for pair in caches[-1].pairs for box in pair.boxes):
             raise ValueError(f"{dataset.path}: shows no drogue in any image; there is nothing to learn from")
     stamps = tuple(
@@ -290,7 +329,7 @@ def open_corpus(
         for dataset in datasets
     )
     places = [(number, index) for number, cache_ in enumerate(caches) for index in range(len(cache_.pairs))]
-    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64))
+    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault)
     if not any(len(corpus.boxes(pair, eye)) for pair in corpus.split("train") for eye in (0, 1)):
         raise ValueError(f"{paths[0]}: shows no drogue in any image of the split train; there is nothing to learn from")
     return corpus

@@ -60,6 +60,7 @@ class TrainingResult:
         best_step: the step whose averaged weights it has.
         validation, test: scores on these splits; None for a split without a drogue.
         score_threshold: a box with a lower score is not a drogue.
+        fault: damaged pairs, which were left out, as one line; None for nothing.
     """
 
     file: Path
@@ -67,6 +68,7 @@ class TrainingResult:
     validation: ValidationScores | None
     test: ValidationScores | None
     score_threshold: float
+    fault: str | None = None
 
 
 def train(
@@ -186,6 +188,7 @@ def _evaluate_and_export(
         average_precision(validation.truth, validation.found),
         average_precision(test.truth, test.found),
         threshold,
+        corpus.fault,
     )
     table = _result_table(result, corpus, settings)
     write_text_atomic(out / RESULT_FILE, json.dumps(table, indent=1) + "\n")

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
@@ -135,15 +136,15 @@ class SubsetScores:
     angles_p99_deg: Array | None = None
 
 
-def read_docking(dataset: Location, estimates: Path) -> DockingData:
-    """Read and score a dataset with its estimates.
+def read_docking(dataset: Location, estimates: Path, faults: PairFaults | None = None) -> DockingData:
+    """Read and score a dataset with its estimates; damaged pairs are left out where `faults` counts them.
 
     Raises:
         ValueError: dataset or file cannot be read, do not belong together, or hold none of the contenders.
     """
     data = Dataset(dataset)
     file = read_estimates_file(estimates, data.frame_indices)
-    records = {index: data.record(index) for index in sorted(data.frame_indices)}
+    records = {record.frame_index: record for record in data.records(faults)}
     first_frames: dict[int | None, int] = {}
     for index, record in records.items():
         first_frames.setdefault(record.sequence_id, index)

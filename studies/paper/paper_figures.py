@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PixelBox
@@ -84,8 +85,10 @@ class _Plane(NamedTuple):
     upwards: str
 
 
-def read_corpus(dataset: Location) -> CorpusBoxes:
+def read_corpus(dataset: Location, faults: PairFaults | None = None) -> CorpusBoxes:
     """Read the boxes of every pair.
+
+    Damaged pairs are left out where `faults` counts them.
 
     Raises:
         ValueError: no such dataset, a record that cannot be read, or no drogue in it.
@@ -93,8 +96,7 @@ def read_corpus(dataset: Location) -> CorpusBoxes:
     data = Dataset(dataset)
     boxes: list[PixelBox] = []
     distances: list[float] = []
-    for index in data.frame_indices:
-        record = data.record(index)
+    for record in data.records(faults):
         for view in (record.views.left, record.views.right):
             if view.box_visible_xywh_px is not None and record.conditions.distance_m is not None:
                 boxes.append(view.box_visible_xywh_px)

@@ -13,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from pydantic import ValidationError
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.storage import Location
 from droguekit.scoring.detection.detection_figures import is_timed, speed_panel
 from droguekit.scoring.report.figures import MethodStyle, legend_key, method_styles
@@ -130,16 +131,16 @@ class FigureGroup:
     legend: list[tuple[str, Markup]] = field(default_factory=list)
 
 
-def build_page(inputs: ReportInputs) -> str:
-    """The whole page.
+def build_page(inputs: ReportInputs, faults: PairFaults | None = None) -> str:
+    """The whole page; damaged pairs are left out where `faults` counts them.
 
     Raises:
         ValueError: no input at all, or one that cannot be read or does not fit the others.
     """
-    docking = [read_docking(*navigated) for navigated in inputs.docking]
-    bench = [read_semi_physical(*navigated) for navigated in inputs.semi_physical]
+    docking = [read_docking(*navigated, faults) for navigated in inputs.docking]
+    bench = [read_semi_physical(*navigated, faults) for navigated in inputs.semi_physical]
     detection = None if inputs.detection is None else read_detection(inputs.detection)
-    corpus = None if inputs.corpus is None else read_corpus(inputs.corpus)
+    corpus = None if inputs.corpus is None else read_corpus(inputs.corpus, faults)
     if not (docking or bench or detection or corpus):
         raise ValueError("report: nothing to report on; give --docking, --semi-physical, --detection or --corpus")
     facts = code_facts()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datasets_manifest.storage.storage import as_location
-from droguekit.cli.arguments import Place, output_option
+from droguekit.cli.arguments import Place, exit_with_fault, output_option
 
 if TYPE_CHECKING:
     from studies.paper.paper_report import DatasetWithEstimates, ReportInputs
@@ -58,7 +58,8 @@ def report(
 ) -> None:
     """Put our numbers beside the seed paper's: its tables and figures, as one page and as a PDF.
 
-    Every input is optional. What is not given is left out, with a line that says which command makes it.
+    Every input is optional. What is not given is left out, with a line that says which command makes it. Exits with 1
+    where a record is damaged, and leaves its pair out.
     """
     from studies.paper.paper_report import ReportInputs
 
@@ -74,7 +75,7 @@ def report(
         corpus=None if corpus is None else as_location(str(corpus)),
     )
     _check_outputs(inputs, html, pdf)
-    _write(inputs, html, pdf)
+    exit_with_fault(_write(inputs, html, pdf))
 
 
 def _check_outputs(inputs: ReportInputs, html: Path | None, pdf: Path | None) -> None:
@@ -100,19 +101,22 @@ def _check_outputs(inputs: ReportInputs, html: Path | None, pdf: Path | None) ->
         raise ValueError(f"--html, --pdf: must be two files, got {html} for both")
 
 
-def _write(inputs: ReportInputs, html: Path | None, pdf: Path | None) -> None:
-    """Write the page first, so that it is there when no browser can print it."""
+def _write(inputs: ReportInputs, html: Path | None, pdf: Path | None) -> str | None:
+    """Write the page first, so that it is there when no browser can print it; the fault of damaged pairs, or None."""
     from datasets_manifest.atomic import write_text_atomic
+    from datasets_manifest.storage.pair_faults import PairFaults
     from droguekit.visualization.print_pdf import print_pdf
     from studies.paper.paper_report import build_page
 
-    text = build_page(inputs)
+    faults = PairFaults()
+    text = build_page(inputs, faults)
     if html is not None:
         write_text_atomic(html, text)
         typer.echo(f"wrote {html}")
     if pdf is not None:
         print_pdf(text, pdf)
         typer.echo(f"wrote {pdf}")
+    return faults.line()
 
 
 def _pair(option: str, text: str) -> DatasetWithEstimates:

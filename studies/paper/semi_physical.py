@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, Feature, PoseEstimate
@@ -67,8 +68,8 @@ class SemiPhysicalRun(ExperimentData):
     methods: Mapping[str, StationErrors]
 
 
-def read_semi_physical(dataset: Location, estimates: Path) -> SemiPhysicalRun:
-    """Read a dataset of the experiment with its estimates.
+def read_semi_physical(dataset: Location, estimates: Path, faults: PairFaults | None = None) -> SemiPhysicalRun:
+    """Read a dataset of the experiment with its estimates; damaged pairs are left out where `faults` counts them.
 
     Raises:
         ValueError: dataset or file cannot be read or do not belong together, or the dataset has no stations or no
@@ -78,7 +79,7 @@ def read_semi_physical(dataset: Location, estimates: Path) -> SemiPhysicalRun:
     stations = data.manifest.recipe.distance.stations_m
     if not stations:
         raise ValueError(f"{dataset}: its recipe has no stations; the experiment is the recipe semi-physical-5 or -7")
-    records = {index: data.record(index) for index in data.frame_indices}
+    records = {record.frame_index: record for record in data.records(faults)}
     shown = {index: record for index, record in records.items() if record.left_from_drogue is not None}
     if not shown or any(record.frame.rangefinder_reading_m is None for record in shown.values()):
         raise ValueError(f"{dataset}: has no rangefinder's readings; its recipe needs the section [rangefinder]")

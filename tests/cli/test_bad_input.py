@@ -170,6 +170,21 @@ def test_a_truncated_record(damaged: Path, tmp_path: Path) -> None:
     assert re.search(r"000002/record\.json", result.stdout)
     _assert_refused(_run("preview", damaged, "--out", tmp_path / "sheet.png"), r"000002/record\.json: is truncated")
     assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+    estimates, page = tmp_path / "estimates.jsonl", tmp_path / "report.html"
+    assert _run("navigate", damaged, "--method", "constant", "--out", estimates).returncode == FAULT
+    for command in (
+        ["benchmark", damaged, "--estimates", estimates, "--html", page],
+        ["export", damaged, "--format", "parquet", "--out", tmp_path / "table"],
+    ):
+        result = _run(*command)
+        assert result.returncode == FAULT
+        assert re.search(r"1 pair has no result by a fault, first pair 2: .*000002/record\.json", result.stderr)
+        assert "Traceback" not in result.stderr
+    assert page.stat().st_size > 0
+    for written in (estimates, page):
+        written.unlink()
+    shutil.rmtree(tmp_path / "table")
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
-from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import StereoDetection
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.realtime import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
 from nav.runner import LATE, add_smoothed, open_navigator
 from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair

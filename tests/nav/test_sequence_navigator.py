@@ -15,8 +15,8 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detection, StereoDetection
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.filtering.motion_model import FilterSettings
 from nav.pair_navigator import PairNavigator
 from nav.runner import add_smoothed, open_navigator

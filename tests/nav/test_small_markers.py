@@ -10,8 +10,9 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, StereoRig
-from nav.centroids.disc_coverage import spread_discs
-from nav.centroids.small_centroids import small_centroids
+from nav.centroids.binary_centroids import small_centroids
+from nav.centroids.disc_coverage import spread_discs, spread_ring_shares
+from nav.matching.face_ring import find_face_ring, fit_face_ring, has_narrow_face
 from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import match_ring
 from nav.pair_navigator import correspond
@@ -108,3 +109,56 @@ def test_lamps_that_are_too_faint_are_told() -> None:
     told = measured(layout, images, pose)
     assert isinstance(told, NoFixReason)
     assert "peaks of light" in told.reason
+
+
+FACE = MarkerLayout(ring(12), RADIUS_M, None, face_inner_radius_m=0.25, face_outer_radius_m=RIM_M)
+
+
+def face_image(affine: np.ndarray, lamp_dn: float, rng: np.random.Generator) -> np.ndarray:
+    """A dark face with lamps before a sky of 3000 DN with a slope, and noise of 30 DN."""
+    half, middle = 60, np.array([100.0, 80.0])
+    shift = affine[:, 2] - middle
+    opening, beyond = spread_ring_shares(shift[None], affine[None, :, :2], (0.25, RIM_M), 0.45, half, 1)[0]
+    image = 200 + 2800 * (opening + beyond)
+    places = FACE.centers_m[:, :2] @ affine[:, :2].T + shift
+    radius = np.full(12, RADIUS_M * np.sqrt(np.linalg.det(affine[:, :2])))
+    for place, one in zip(np.rint(places).astype(int), range(12), strict=True):
+        drawn = spread_discs(places[one : one + 1] - place, radius[:1], np.array([0.45]), 4, 1).light[0]
+        x, y = place + half
+        image[y - 4 : y + 5, x - 4 : x + 5] += lamp_dn * drawn
+    whole = np.full((160, 200), 3000.0)
+    whole[20:141, 40:161] = image
+    return (whole + np.arange(200) + rng.normal(0, 30, whole.shape)).clip(0, 4095).astype(np.uint16)
+
+
+@pytest.mark.parametrize("scale", [31.0, 38.0, 55.0])
+def test_lamps_that_drown_in_the_sky_are_placed_by_the_picture_of_all_of_them(scale: float) -> None:
+    """Lamps of 0.3 to 0.55 px, none of which the sky beside the face leaves as a peak of its own."""
+    rng = np.random.default_rng(11)
+    turn = np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]])
+    affine = np.column_stack([scale * turn @ np.diag([1.0, 0.95]), [101.3, 79.6]])
+    image = face_image(affine, 8000.0, rng)
+    expected = FACE.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
+    for found in (fit_face_ring(image, FACE, np.array([102.0, 81.0]), 1.1 * scale), find_face_ring(image, FACE)):
+        assert found is not None
+        places = FACE.centers_m[:, :2] @ found.affine[:, :2].T + found.affine[:, 2]
+        off = min(np.hypot(*(np.roll(expected, k, axis=0) - places).T).max() for k in range(12))
+        # A quarter of the smallest lamp's spread; peaks of noise are a pixel and more away.
+        assert off < 0.15
+
+
+def test_a_face_without_lamps_and_a_sky_without_a_face_are_no_drogue() -> None:
+    rng = np.random.default_rng(12)
+    affine = np.column_stack([38.0 * np.eye(2), [101.3, 79.6]])
+    assert find_face_ring(face_image(affine, 0.0, rng), FACE) is None
+    assert find_face_ring(rng.normal(3000, 30, (160, 200)).astype(np.uint16), FACE) is None
+    assert not has_narrow_face(layout_of(ring(12)))
+
+
+@pytest.mark.parametrize("tilt_deg", [12.0, 20.0])
+def test_markers_that_are_small_beside_their_ring_are_matched_in_a_tilted_one(tilt_deg: float) -> None:
+    layout = layout_of(ring(12))
+    places = ring(12)[:, :2] * [260.0, 260.0 * np.cos(np.radians(tilt_deg))] + 200
+    found = match_ring(Blobs(places, np.full(12, np.pi * 2.9**2)), layout)
+    assert found is not None
+    assert found.count == 12

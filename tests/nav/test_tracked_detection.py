@@ -10,8 +10,8 @@ import pytest
 from datasets_manifest.types.images import StereoImages
 from drogue_models.presets import load_drogue
 from geometry.stereo import EYES
-from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detection, StereoDetection
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.tracked_detection import TrackedDetector, tracked_detector_factory
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 from tests.support.painted_sequences import RATE_HZ, Look, Place, film, overlap

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PixelBox
 from droguekit.scoring.detection.detection_figures import (
@@ -78,13 +79,16 @@ class PicturedImage(NamedTuple):
     is_miss: bool = False
 
 
-def write_detection_report(dataset: Location, scored: ScoredDetections, out_html: Path) -> None:
+def write_detection_report(
+    dataset: Location, scored: ScoredDetections, out_html: Path, faults: PairFaults | None = None
+) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:
         dataset: the dataset's folder or URL, for pictures.
         scored: the result of `score_detections`.
         out_html: where to write.
+        faults: count pairs whose picture cannot be shown; without, such a pair is an error.
 
     Raises:
         ValueError: an image cannot be read.
@@ -115,7 +119,7 @@ def write_detection_report(dataset: Location, scored: ScoredDetections, out_html
             {name: d.sequences for name, d in result.detectors.items() if d.sequences is not None}, "detector", styles
         ),
         pictured=best,
-        pictures=detection_pictures(dataset, matches[best], thresholds[best]),
+        pictures=detection_pictures(dataset, matches[best], thresholds[best], faults),
         least=(LEAST_BOXES, LEAST_SCENES),
     )
     write_text_atomic(out_html, page)
@@ -153,16 +157,19 @@ def detection_sentences(result: DetectionResult, name: str) -> list[str]:
     return sentences
 
 
-def detection_pictures(dataset: Location, matches: Matches, threshold: float) -> list[PictureGroup]:
+def detection_pictures(
+    dataset: Location, matches: Matches, threshold: float, faults: PairFaults | None = None
+) -> list[PictureGroup]:
     """Groups of pictures; those without any are left out.
 
     Args:
         dataset: the dataset's folder or URL.
         matches: of one detector.
         threshold: from which score a box counts.
+        faults: as for `write_detection_report`.
 
     Raises:
-        ValueError: an image cannot be read; names the file.
+        ValueError: an image cannot be read, and nothing counts faults; names the file.
     """
     found = found_images(matches, threshold)
     chosen = [
@@ -171,7 +178,9 @@ def detection_pictures(dataset: Location, matches: Matches, threshold: float) ->
         ("Worst false alarms", worst_false_alarms(matches, threshold)),
     ]
     source = BlindDataset(dataset)
-    return [PictureGroup(title, [_tile(source, one) for one in shown]) for title, shown in chosen if shown]
+    groups = ((title, [_tile(source, one, faults) for one in shown]) for title, shown in chosen)
+    shown_groups = ((title, [tile for tile in tiles if tile is not None]) for title, tiles in groups)
+    return [PictureGroup(title, tiles) for title, tiles in shown_groups if tiles]
 
 
 def found_images(matches: Matches, threshold: float) -> list[PicturedImage]:
@@ -210,8 +219,11 @@ def _area(box: PixelBox | None) -> float:
     return 0.0 if box is None else box[2] * box[3]
 
 
-def _tile(source: BlindDataset, shown: PicturedImage) -> tuple[Tile, str]:
-    images = source.pair(shown.image.frame_index).images
+def _tile(source: BlindDataset, shown: PicturedImage, faults: PairFaults | None) -> tuple[Tile, str] | None:
+    pair = read_or_note(shown.image.frame_index, source.pair, faults)
+    if pair is None:
+        return None
+    images = pair.images
     if shown.image.eye == "right":
         images = replace(images, left=images.right, right=images.left)
     true, found = shown.image.box_xywh, None if shown.box is None else shown.box.box_xywh

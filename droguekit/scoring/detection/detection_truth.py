@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from datasets_manifest.storage.blind import read_blind_index
 from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.records import PairRecord, PixelBox
@@ -75,8 +76,12 @@ class DetectionTruth:
     sequences: tuple[TrueSequence, ...] = ()
 
 
-def read_detection_truth(dataset: Location) -> DetectionTruth:
+def read_detection_truth(dataset: Location, faults: PairFaults | None = None) -> DetectionTruth:
     """What is to be found in a dataset: from its records, or from the boxes that came with imported images.
+
+    Args:
+        dataset: its folder or URL.
+        faults: count pairs whose record is damaged, which are then left out; without, such a pair is an error.
 
     Raises:
         ValueError: no such dataset, a record that cannot be read, or an imported dataset without boxes.
@@ -88,9 +93,8 @@ def read_detection_truth(dataset: Location) -> DetectionTruth:
     size_px = (camera.width_px, camera.height_px)
     splits = source.manifest.split_of_frame()
     images, states = [], []
-    for index in source.frame_indices:
-        record = source.record(index)
-        images += [image_truth(record, eye, splits[index], size_px) for eye in EYES]
+    for record in source.records(faults):
+        images += [image_truth(record, eye, splits[record.frame_index], size_px) for eye in EYES]
         states.append(true_state(record))
     manifest = source.manifest
     return DetectionTruth(manifest.name, manifest.dataset_sha256, tuple(images), true_sequences(states))

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.pair_faults import PairFaults, fault_reason, unreadable_reason
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.results.detection_result import DetectedBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
-from nav.pair_measurement import PairFaults, fault_reason, unreadable_reason
 
 LEAST_SCORE = 0.001
 """Boxes with at least this score are kept: average precision needs low scores too."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages, display_table
 from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
@@ -122,17 +123,27 @@ class Tile:
     height_px: int
 
 
-def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
-    """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue."""
+def contact_tiles(dataset: Dataset, count: int = 12, faults: PairFaults | None = None) -> list[Tile]:
+    """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue.
+
+    Args:
+        dataset: of the pairs.
+        count: how many.
+        faults: count damaged pairs, which are left out; without, such a pair is an error.
+    """
     indices = dataset.frame_indices
     candidates = [indices[k] for k in evenly_spaced(len(indices), _MOST_CANDIDATES)]
-    records = [record for record in map(dataset.record, candidates) if record.left_from_drogue is not None]
+    read = (read_or_note(index, dataset.record, faults) for index in candidates)
+    records = [record for record in read if record is not None and record.left_from_drogue is not None]
     records.sort(key=lambda record: (_distance_m(record), record.frame_index))
     tiles = []
     for record in (records[k] for k in evenly_spaced(len(records), count)):
+        images = read_or_note(record.frame_index, dataset.images, faults)
+        if images is None:
+            continue
         view = record.views.left
         centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
-        picture = label_picture(display_picture(dataset.images(record.frame_index)), view.box_visible_xywh_px, centers)
+        picture = label_picture(display_picture(images), view.box_visible_xywh_px, centers)
         tiles.append(tile_of(record.frame_index, _distance_m(record), picture))
     return tiles
 

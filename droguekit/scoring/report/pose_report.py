@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import read_estimates
@@ -315,7 +316,9 @@ def _share(fraction: float | None) -> str:
     return percent(None if fraction is None else round(fraction, 3))
 
 
-def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, out_html: Path) -> None:
+def write_report(
+    dataset: Location, estimates: Path, result: BenchmarkResult, out_html: Path, faults: PairFaults | None = None
+) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:
@@ -323,6 +326,7 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
         estimates: the file that was scored, for the times that its methods took.
         result: of `run_benchmark` for both.
         out_html: where to write.
+        faults: count pairs whose picture cannot be shown; without, such a pair is an error.
 
     Raises:
         ValueError: dataset or estimates cannot be read, or the result is of another dataset.
@@ -339,7 +343,7 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
         result=result,
         sentences=result_sentences(result),
         facts=dataset_facts(data.manifest, estimates.name),
-        tiles=[(tile, plain_number(tile.distance_m)) for tile in contact_tiles(data)],
+        tiles=[(tile, plain_number(tile.distance_m)) for tile in contact_tiles(data, faults=faults)],
         panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES],
         legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
         many_methods=len(styles) > FEW_METHODS,

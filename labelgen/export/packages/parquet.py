@@ -72,7 +72,7 @@ def write_parquet(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         out.mkdir(parents=True, exist_ok=True)
         with pq.ParquetWriter(part, schema) as writer:
             rows: list[dict[str, Any]] = []
-            for record in log.records(source):
+            for record in log.records(source, with_files=False):
                 log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
                 rows += [view_row(record, eye, splits[record.frame_index]) for eye in EYES]
                 if len(rows) >= _ROWS_AT_ONCE:

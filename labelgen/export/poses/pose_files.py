@@ -175,7 +175,7 @@ def write_tum(dataset: Location, out: Path, log: ExportLog, estimates: Path | No
         return [out / name for name in names]
     order, names = SequenceOrder(), []
     with new_folder(out) as folder:
-        stamped = _stamped(order, log.records(Dataset(dataset)))
+        stamped = _stamped(order, log.records(Dataset(dataset), with_files=False))
         for sequence_id, pairs in groupby(stamped, key=lambda pair: pair[0].sequence_id):
             names.append(f"{sequence_name(sequence_id)}.txt")
             with (folder / names[-1]).open("w", encoding="utf-8") as stream:
@@ -244,7 +244,7 @@ def _places(dataset: Location, log: ExportLog, has_truth: bool) -> Iterator[tupl
     """Frame index, time stamp [ns], name of the sequence and record, if there is one, of every pair."""
     if has_truth:
         order = SequenceOrder()
-        for record in log.records(Dataset(dataset)):
+        for record in log.records(Dataset(dataset), with_files=False):
             yield record.frame_index, order.stamp_ns(record), sequence_name(record.sequence_id), record
         return
     frames, last_ns = FrameStore(dataset), -1

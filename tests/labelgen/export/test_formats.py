@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.pair_faults import PairFaults
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 from tests.support.drawn_pairs import Pair
@@ -186,6 +188,29 @@ def test_what_is_cut_off_is_told(name: str, mixed_dataset: Path, tmp_path: Path)
     # One drogue is outside both images, one is cut off by either.
     assert log.losses["views with a drogue of which no pixel is seen: without a label"] == 2
     assert log.losses["drogues that leave the image: their boxes end at its border"] == 2
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("opencv", "kalibr", "ros-camera-info")])
+def test_a_damaged_pair_is_left_out_and_counted(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
+    first = min((copy / "frames").iterdir())
+    (first / "record.json").write_bytes((first / "record.json").read_bytes()[:-100])
+    faults = PairFaults()
+    write_export(name, copy, tmp_path / "out", ExportLog(faults=faults))
+    assert faults.first is not None
+    assert faults.count == 1 and faults.first[0] == int(first.name)
+    assert re.search(r"record\.json: is truncated", faults.first[1])
+    assert tree(tmp_path / "out")
+
+
+def test_a_pair_with_a_changed_image_is_no_half_pair_in_an_export(mixed_dataset: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
+    last = max((copy / "frames").iterdir())
+    (last / "right.png").write_bytes((last / "right.png").read_bytes()[:-100])
+    faults = PairFaults()
+    write_export("yolo", copy, tmp_path / "out", ExportLog(faults=faults))
+    assert faults.count == 1
+    assert not [path for path in (tmp_path / "out").rglob("*") if last.name in path.name]
 
 
 def contradict(table: dict, what: str) -> None:

@@ -17,7 +17,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig, paper_rig
 from nav.centroids.binary_centroids import binary_centroids, quantisation_variance_px2
-from nav.detector.color_blob import ColorBlobDetector
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.matching.marker_channel import marker_channel, marker_color
 from tests.support.painted_pairs import make_pose, paint_pair
 

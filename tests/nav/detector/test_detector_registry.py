@@ -12,7 +12,6 @@ from datasets_manifest.types.estimates import NoFix
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
 from nav.detector import detector_registry as registry
-from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector_registry import (
     DEFAULT_DETECTOR,
     detector_factory,
@@ -21,6 +20,7 @@ from nav.detector.detector_registry import (
     open_detector,
 )
 from nav.detector.model_metadata import ModelMetadata
+from nav.detector.ring_detectors import ColorBlobDetector
 from nav.runner import navigate
 from tests.support.detector_networks import write_red_squares
 from tests.support.painted_pairs import make_pose, paint_pair

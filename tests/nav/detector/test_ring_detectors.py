@@ -9,7 +9,7 @@ import pytest
 from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters, even_ring
 from nav.detector.detector_registry import detector_factory, network_file
-from nav.detector.peak_ring import PeakRingDetector
+from nav.detector.ring_detectors import PeakRingDetector
 
 LAMPS = DrogueParameters(
     name="lamps",
