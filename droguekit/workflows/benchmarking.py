@@ -86,8 +86,8 @@ def run_benchmarks(
     if open_storage(dataset).exists(BLIND_FILE):
         check = check_blind_dataset(dataset, estimates, json_out, html_out, faults)
         return BenchmarkOutcome(_blind_lines(check), faults.line())
-    result = benchmark_dataset(dataset, estimates, json_out, html_out, faults)
-    return BenchmarkOutcome(_error_lines(result), faults.line())
+    scored = benchmark_dataset(dataset, estimates, json_out, html_out, faults)
+    return BenchmarkOutcome(_error_lines(scored), faults.line())
 
 
 def _error_lines(result: BenchmarkResult) -> Iterator[str]:

@@ -159,7 +159,7 @@ def _below_line(distance: Array, wide: Array, narrow: Array) -> Array:
         distance: towards the line, below zero where the middle is beyond it.
         wide, narrow: larger and smaller component of the line's unit normal, both above zero.
     """
-    total = 0.0
+    total = np.zeros_like(distance)
     for sign, end in ((1, wide + narrow), (-1, wide - narrow), (-1, narrow - wide), (1, -wide - narrow)):
         total = total + sign * np.maximum(distance + end / 2, 0) ** 2 / 2
     share: Array = total / (wide * narrow)

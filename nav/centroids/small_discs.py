@@ -265,13 +265,15 @@ class _Prior:
     @property
     def means(self) -> Array32:
         """(N, P) the likeliest parameters."""
-        return np.concatenate([self.places_px, self.amounts], axis=1).astype(np.float32)
+        means: Array32 = np.concatenate([self.places_px, self.amounts], axis=1).astype(np.float32)
+        return means
 
     @property
     def weights(self) -> Array32:
         """(N, P) inverse variances of the parameters."""
         place = np.full_like(self.places_px, _WITHIN_PIXEL_PX**-2)
-        return np.concatenate([place, self.information], axis=1).astype(np.float32)
+        weights: Array32 = np.concatenate([place, self.information], axis=1).astype(np.float32)
+        return weights
 
 
 def _common_amounts(discs: Ellipses, minimum: Minimum, prior: _Prior, misfit: Array, kind: tuple[bool, int]) -> _Prior:

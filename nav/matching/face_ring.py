@@ -93,7 +93,7 @@ def fit_face_ring(channel: Pixels, layout: MarkerLayout, center_px: Array, scale
         return None
     rest, amounts, deviation = picture.misfit(affine, with_lamps=True)
     sky = picture.misfit(None, with_lamps=False)[0]
-    strength, explained = amounts[-1] / deviation, 1 - rest / max(sky, np.finfo(float).tiny)
+    strength, explained = float(amounts[-1]) / deviation, 1 - rest / max(sky, float(np.finfo(float).tiny))
     if not (strength > _LEAST_STRENGTH and explained > _LEAST_EXPLAINED):
         return None
     affine[:, 2] += (left, top)
