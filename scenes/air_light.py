@@ -170,14 +170,18 @@ class LayeredAir:
         """(..., 3) radiance of infinitely deep air along (..., 3) unit directions. [cd/m2]"""
         return self.sky_and_air(directions)[1]
 
-    def before_ground(self, ground: Radiance, directions: NDArray[np.float32], air: Radiance) -> Radiance:
+    def before_ground(
+        self, ground: Radiance, directions: NDArray[np.float32], air: Radiance, level: NDArray[np.float32] | None = None
+    ) -> Radiance:
         """Ground behind the air in front of it, in place.
 
         Args:
             ground: (H, W, 3) its radiance. [cd/m2]
             directions: (H, W, 3) unit vectors in world axes.
             air: (H, W, 3) the second result of `sky_and_air`. [cd/m2]
+            level: (H, W, 3) directions in which level ground is as far away as the hills along `directions`, or None.
         """
+        directions = directions if level is None else level
         altitude_m = np.float32(self._environment.altitude_m)
         distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
         clear = np.exp(-distance_m * np.float32(self._environment.extinction_per_m))[..., None]

@@ -17,9 +17,9 @@ from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
 from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
 from scenes.clouds.cloud_layers import CloudLayerRenderer
-from scenes.ground.ground_radiance import Ground
+from scenes.ground.ground_radiance import Ground, highest_land_sine
 from scenes.ground.sea import GroundLight
-from scenes.ground_view import pixel_angle_rad
+from scenes.ground_view import EARTH_M, pixel_angle_rad
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.photometry import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
@@ -73,6 +73,10 @@ class EnvironmentRadiance:
         """
         return self.air.sky_and_air(directions)
 
+    def _above_ground(self, directions: NDArray[np.float32]) -> Radiance:
+        """What ground mirrors: `radiance` without hills, along (H, W, 3) directions above the horizon."""
+        return self._layered(directions, *self.clear_radiance(directions), has_ground=False)
+
     def radiance(
         self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
     ) -> Radiance:
@@ -87,6 +91,11 @@ class EnvironmentRadiance:
         """
         if sky is None or horizon is None:
             sky, horizon = self.clear_radiance(directions)
+        return self._layered(directions, sky, horizon, has_ground=True)
+
+    def _layered(
+        self, directions: NDArray[np.float32], sky: Radiance, horizon: Radiance, has_ground: bool
+    ) -> Radiance:
         total = sky.copy()
         layers = sorted(self.environment.clouds, key=lambda layer: -abs(layer.height_above_camera_m))
         lowest = self.air.round_horizon_sine or 0.0
@@ -102,7 +111,8 @@ class EnvironmentRadiance:
         for layer, part, picture in zip(layers, parts, pictures, strict=True):
             if not layer.is_above:
                 uncovered[part] *= 1.0 - picture[..., 3]
-        self._put_ground(total[rows], directions[rows], horizon[rows], uncovered[rows])
+        if has_ground:
+            self._put_ground(total[rows], directions[rows], horizon[rows], uncovered[rows])
         for part, picture in zip(parts, pictures, strict=True):
             total[part] *= 1.0 - picture[..., 3:]
             total[part] += picture[..., :3]
@@ -156,14 +166,15 @@ class EnvironmentRadiance:
         """Land or sea, in the light that reaches it."""
         beam_lux, to_beam = self.air.ground_beam_lux, self.beam_direction
         sky_lux = np.maximum(self.ground_illuminance_lux - beam_lux * max(float(to_beam[2]), 0.0), 0.0)
-        light = GroundLight(sky_lux=sky_lux, beam_direction=to_beam, beam_lux=beam_lux, sky_radiance=self.radiance)
+        light = GroundLight(sky_lux=sky_lux, beam_direction=to_beam, beam_lux=beam_lux, sky_radiance=self._above_ground)
         clear = self.air.ground_clear if isinstance(self.air, ScatteringAir) else None
         return Ground(self.environment, light, clear)
 
     def _ground_below(self, directions: NDArray[np.float32]) -> float:
         """Vertical component below which pixels show some ground."""
         horizon = self.air.round_horizon_sine
-        return 0.0 if horizon is None else min(horizon + pixel_angle_rad(directions), 0.0)
+        level = 0.0 if horizon is None else min(horizon + pixel_angle_rad(directions), 0.0)
+        return max(level, highest_land_sine(self.environment))
 
     def _put_ground(
         self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
@@ -171,8 +182,12 @@ class EnvironmentRadiance:
         """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` is its visible share."""
         if directions.size == 0:
             return
-        seen = self.air.before_ground(self.ground.radiance(directions, uncovered), directions, horizon)
+        met = self.ground.seen(directions)
+        level = None if met is None else self._level_rays(directions, met.distance_m)
+        seen = self.air.before_ground(self.ground.radiance(directions, uncovered, met), directions, horizon, level)
         share = self.air.horizon_share(directions, pixel_angle_rad(directions))
+        if met is not None:
+            share = np.maximum(share, met.share)
         whole = (share == 1.0).all(axis=1)
         # Whole rows at once where possible: a masked copy takes as long as everything before.
         total[whole] = seen[whole]
@@ -180,6 +195,16 @@ class EnvironmentRadiance:
         mixed = (share > 0.0) & (share < 1.0)
         if mixed.any():
             total[mixed] += share[mixed][:, None] * (seen[mixed] - total[mixed])
+
+    def _level_rays(self, directions: NDArray[np.float32], distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W, 3) rays in whose directions level ground is (H, W) as far away; they have as much air before it."""
+        altitude_m = self.environment.altitude_m
+        falls = np.float32(altitude_m) / np.maximum(distance_m, np.float32(altitude_m))
+        if self.air.round_horizon_sine is not None:
+            falls = falls + distance_m / np.float32(2.0 * EARTH_M)
+        level = directions.copy()
+        level[..., 2] = -np.minimum(falls, np.float32(1.0))
+        return level
 
     def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
         """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity."""

@@ -19,7 +19,7 @@ FARTHEST_M = 4e5  # beyond this distance haze hides everything
 # A piece seen at a grazing angle is elongated; it is averaged over at most so many points along its length.
 _MOST_PLACES = 5
 _NARROWEST_RAD = 1e-5
-_EARTH_M = 6.371e6
+EARTH_M = 6.371e6
 _LEAST_SINE = 0.002
 
 
@@ -143,34 +143,54 @@ class GroundView:
     along_m: Field
     places: int
 
-    def average(
-        self, tile: MipTile, turn: tuple[Field, Field] | None = None, shift: tuple[Field, Field] | None = None
-    ) -> Field:
-        """Mean of a ground texture over each piece.
+    def average(self, *tiles: MipTile, axes: Axes | None = None) -> list[Field]:
+        """Means of ground textures over each piece.
 
         Args:
-            tile: the texture.
-            turn: (H, W) cosine and sine of the texture's rotation, or None.
-            shift: (H, W) shift along the texture's own axes, or None. [m]
+            tiles: the textures.
+            axes: of the textures; None for those of the world.
 
         Returns:
-            (H, W, C) values.
+            (H, W, C) values of each.
         """
         u, v, du, dv = self.x_m, self.y_m, self.away_x, self.away_y
-        if turn is not None:
-            cosine, sine = turn
-            u, v = cosine * u + sine * v, cosine * v - sine * u
-            du, dv = cosine * du + sine * dv, cosine * dv - sine * du
-        if shift is not None:
-            u, v = u + shift[0], v + shift[1]
+        if axes is not None:
+            u, v = axes.turned(u, v)
+            du, dv = axes.turned(du, dv)
+            u, v = u + axes.shift_u_m, v + axes.shift_v_m
         width_m = np.maximum(self.across_m, self.along_m / np.float32(self.places))
-        total: Field | None = None
+        totals: list[Field] = []
         for place in range(self.places):
             step_m = np.float32((place + 0.5) / self.places - 0.5) * self.along_m
-            part = tile.sample(u + step_m * du, v + step_m * dv, width_m)
-            total = part if total is None else total + part
-        assert total is not None
-        return total / np.float32(self.places)
+            at = u + step_m * du, v + step_m * dv
+            for index, tile in enumerate(tiles):
+                part = tile.sample(*at, width_m)
+                if place == 0:
+                    totals.append(part)
+                else:
+                    totals[index] += part
+        return [total / np.float32(self.places) for total in totals]
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """Axes of a texture on the ground: turned, some places mirrored, and shifted.
+
+    Attributes:
+        cosine, sine: of the angle from east towards north to the texture's columns.
+        flip: (H, W) 1, or -1 where its rows are mirrored.
+        shift_u_m, shift_v_m: (H, W) shift along columns and rows. [m]
+    """
+
+    cosine: np.float32
+    sine: np.float32
+    flip: Field
+    shift_u_m: Field
+    shift_v_m: Field
+
+    def turned(self, x: Field, y: Field) -> tuple[Field, Field]:
+        """(H, W) components along columns and rows of vectors east and north."""
+        return self.cosine * x + self.sine * y, self.flip * (self.cosine * y - self.sine * x)
 
 
 def pixel_angle_rad(directions: NDArray[np.float32]) -> float:
@@ -204,6 +224,13 @@ def ground_view(
     else:
         sine = np.maximum(-directions[..., 2], np.float32(altitude_m / FARTHEST_M))
         distance_m = np.float32(altitude_m) / sine
+    return view_at(directions, distance_m, sine, angle_rad, offset_m)
+
+
+def view_at(
+    directions: NDArray[np.float32], distance_m: Field, sine: Field, angle_rad: float, offset_m: tuple[float, float]
+) -> GroundView:
+    """Pieces of ground at (H, W) distances [m] along rays that meet them at (H, W) sines; rest as in `ground_view`."""
     level = np.maximum(np.hypot(directions[..., 0], directions[..., 1]), np.float32(1e-6))
     across_m = distance_m * np.float32(angle_rad)
     stretch = 1.0 / float(sine.mean())
@@ -221,11 +248,11 @@ def ground_view(
 
 def _round_ground(up: Field, altitude_m: float) -> tuple[Field, Field]:
     """Distance to a round Earth along rays [m], and sine of the angle at which they meet it; at most to the horizon."""
-    radius_m = _EARTH_M + altitude_m
+    radius_m = EARTH_M + altitude_m
     falls_m = -up.astype(np.float64) * radius_m
-    square = altitude_m * (2.0 * _EARTH_M + altitude_m)
+    square = altitude_m * (2.0 * EARTH_M + altitude_m)
     root = np.sqrt(np.maximum(falls_m * falls_m - square, 0.0))
     distance_m = np.minimum(square / np.maximum(falls_m + root, 1.0), np.sqrt(square))
     # The cosine theorem at the place where the ray ends.
-    sine = np.maximum((square - distance_m * distance_m) / (2.0 * _EARTH_M * distance_m), _LEAST_SINE)
+    sine = np.maximum((square - distance_m * distance_m) / (2.0 * EARTH_M * distance_m), _LEAST_SINE)
     return distance_m.astype(np.float32), sine.astype(np.float32)

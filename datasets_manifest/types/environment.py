@@ -13,7 +13,7 @@ from drogue_models.untrusted_files import read_regular
 
 CloudKind = Literal["cumulus", "congestus", "stratus", "altocumulus", "cirrus", "contrail", "rain"]
 
-GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town"]
+GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town", "mountains", "snow", "airfield"]
 
 GROUND_KINDS: tuple[GroundKind, ...] = get_args(GroundKind)
 

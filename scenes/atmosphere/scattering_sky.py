@@ -225,10 +225,18 @@ class ScatteringAir(LayeredAir):
         """Sine of the elevation of the horizon."""
         return float(-np.sin(self._dip_rad))
 
-    def before_ground(self, ground: Radiance, directions: NDArray[np.float32], air: Radiance) -> Radiance:
+    def before_ground(
+        self, ground: Radiance, directions: NDArray[np.float32], air: Radiance, level: NDArray[np.float32] | None = None
+    ) -> Radiance:
         """Ground behind the air in front of it, in place."""
-        ground *= self._clear_to_ground(directions)
-        ground += air
+        if level is None:
+            ground *= self._clear_to_ground(directions)
+            ground += air
+            return ground
+        # Hills are nearer than level ground in their direction: the air's light grows with what it hides.
+        clear, behind = self._clear_to_ground(level), self._clear_to_ground(directions)
+        ground *= clear
+        ground += air * ((1.0 - clear) / np.maximum(1.0 - behind, np.float32(1e-4)))
         return ground
 
     def ground_clear(self, sine: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 from drogue_models.frozen_model import ReflectanceRgb
 from geometry.bilinear_sampling import sample_bilinear
-from scenes.ground_view import Field, GroundView, MipTile, power_noise
+from scenes.ground_view import Axes, Field, GroundView, MipTile, power_noise
 from scenes.sky.photometry import Radiance
 
 _WATER_INDEX = 1.34
@@ -141,8 +141,9 @@ class Sea:
             body_rgb: (H, W, 3) or (3,) diffuse reflectance of the water body.
             gusts: (H, W) factor on the variance of the slopes.
         """
-        cosine, sine = (np.full_like(view.x_m, value) for value in self._wind)
-        waves = view.average(_wave_tile(), (cosine, sine))
+        cosine, sine = self._wind
+        ones, zeros = np.ones_like(view.x_m), np.zeros_like(view.x_m)
+        waves = view.average(_wave_tile(), axes=Axes(cosine, sine, ones, zeros, zeros))[0]
         size = np.float32(np.sqrt(_RESOLVED_SHARE * (self._along + self._across))) * np.sqrt(gusts)
         slope_x = size * (cosine * waves[..., 0] - sine * waves[..., 1])
         slope_y = size * (sine * waves[..., 0] + cosine * waves[..., 1])
@@ -294,12 +295,12 @@ def draw_ships(water: Radiance, view: GroundView, ships: tuple[Ship, ...], light
         blur = _widths(view, cosine, sine)
         tail = np.clip(-ahead / np.float32(ship.length_m * _WAKE_LENGTHS), 0.0, 1.0)
         half_m = ship.width_m * (0.35 + 1.6 * tail)
-        wake = _inside(beside, half_m, blur[1]) * (1.0 - tail) * (ahead < 0)
+        wake = inside_share(beside, half_m, blur[1]) * (1.0 - tail) * (ahead < 0)
         water += (0.8 * wake)[..., None] * (np.float32(_WAKE_REFLECTANCE) * level - water)
-        hull = _inside(ahead, ship.length_m / 2, blur[0]) * _inside(beside, ship.width_m / 2, blur[1])
+        hull = inside_share(ahead, ship.length_m / 2, blur[0]) * inside_share(beside, ship.width_m / 2, blur[1])
         water += hull[..., None] * (np.array(ship.hull_rgb, dtype=np.float32) * level - water)
-        aft = _inside(ahead + np.float32(0.38 * ship.length_m), 0.06 * ship.length_m, blur[0])
-        house = aft * _inside(beside, 0.45 * ship.width_m, blur[1])
+        aft = inside_share(ahead + np.float32(0.38 * ship.length_m), 0.06 * ship.length_m, blur[0])
+        house = aft * inside_share(beside, 0.45 * ship.width_m, blur[1])
         water += house[..., None] * (np.array(_HOUSE, dtype=np.float32) * level - water)
 
 
@@ -310,7 +311,7 @@ def _widths(view: GroundView, cosine: np.float32, sine: np.float32) -> tuple[Fie
     return along * view.along_m + across * view.across_m, across * view.along_m + along * view.across_m
 
 
-def _inside(place_m: Field, half_m: Field | float, blur_m: Field) -> Field:
+def inside_share(place_m: Field, half_m: Field | float, blur_m: Field) -> Field:
     """(H, W) share of each piece of sea within a distance of a line."""
     low = np.maximum(place_m - blur_m / 2, -half_m)
     high = np.minimum(place_m + blur_m / 2, half_m)

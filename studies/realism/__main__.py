@@ -1,4 +1,4 @@
-"""Prints how far the modelled skies and clouds are from real ones: `python -m studies.realism`."""
+"""Prints how far modelled skies, clouds and grounds are from real ones: `python -m studies.realism sky`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.environment import Environment, SkyModel
+from datasets_manifest.types.environment import GROUND_KINDS, Environment, SkyModel
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
 from studies.realism.cloud_measures import cloud_table
+from studies.realism.ground_measures import ground_table
 
 SKY_MODELS: tuple[SkyModel, ...] = ("daylight", "scattering")
 # The visibilities at which both have a common clear day: around the camera, and at the ground.
@@ -146,12 +147,19 @@ def sky_table() -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m studies.realism", description=__doc__)
-    parser.add_argument("--photographs", nargs="*", type=Path, default=[], help="pictures of clouds to measure too")
-    parser.add_argument("--clouds", action="store_true", help="measure clouds alone")
+    parts = parser.add_subparsers(dest="part", required=True)
+    parts.add_parser("sky", help="colours and luminances of the clear sky")
+    clouds = parts.add_parser("clouds", help="shapes and edges of clouds")
+    clouds.add_argument("--photographs", nargs="*", type=Path, default=[], help="pictures of clouds to measure too")
+    ground = parts.add_parser("ground", help="share of the ground's pictures that is noise")
+    ground.add_argument("--kinds", nargs="+", choices=GROUND_KINDS, default=GROUND_KINDS, help="of ground")
     given = parser.parse_args(arguments)
-    if not given.clouds:
-        print(sky_table(), end="\n\n")
-    print(cloud_table(given.photographs))
+    if given.part == "sky":
+        print(sky_table())
+    elif given.part == "clouds":
+        print(cloud_table(given.photographs))
+    else:
+        print(ground_table(tuple(given.kinds)))
 
 
 if __name__ == "__main__":
