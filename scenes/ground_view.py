@@ -77,6 +77,7 @@ class MipTile:
                 break
             level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
+        self.most = float(texels[..., 0].max())
 
     def sample(self, x_m: Field, y_m: Field, footprint_m: Field) -> Field:
         """Values averaged approximately over the footprint.

@@ -32,7 +32,7 @@ HEIGHT_SCALE_M = 40.0
 _SIZE_PX, _TEXEL_M = 2048, 4.0
 _TOWN_TEXEL_M = 2.5
 _SEED = 4
-_SHADOW_STEPS_PX = (1, 2, 3, 4, 6, 8, 12, 18, 26)
+_SHADOW_STEPS_PX = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22)
 # Trees let light through and are round: slopes of the canopy count by this share.
 _CANOPY_SLOPE = 0.55
 
@@ -66,7 +66,7 @@ _LAMP_RGB: tuple[tuple[float, Rgb], ...] = (
     (1.0, (0.93, 1.0, 1.10)),
 )
 _LAMP_SPREAD = 0.9  # standard deviation of the logarithm of their intensities
-LAMP_PEAK_CD_M2 = 400.0
+LAMP_PEAK_CD_M2 = 300.0
 """Radiance of the value 1 of a texture of lamps. [cd/m2]"""
 
 
@@ -154,7 +154,12 @@ def lamp_texture(kind: LandKind) -> MipTile:
     light = 0.4 * light + 0.6 * pool
     for bend in land.bends:
         light = _bent(light, *bend)
-    return MipTile(np.clip(light / np.float32(LAMP_PEAK_CD_M2), 0.0, 1.0), texel_m, coded=True)
+    light *= np.float32(1.0 / LAMP_PEAK_CD_M2)
+    # Clipping, bending and eight bits take some light: the rest makes up for it.
+    sent = len(land.lamps_px) * LAMP_CD / (LAMP_PEAK_CD_M2 * (_SIZE_PX * texel_m) ** 2)
+    kept = np.rint(255 * np.sqrt(np.clip(light[..., 1], 0.0, 1.0))) / 255
+    light *= np.float32(sent / float(np.mean(kept * kept, dtype=np.float64)))
+    return MipTile(np.clip(light, 0.0, 1.0), texel_m, coded=True)
 
 
 def _texel_m(kind: LandKind) -> float:
@@ -366,10 +371,10 @@ def _villages(canvas: _Canvas, wood: Field, blocks: list[Rectangle], rng: np.ran
                     _house(canvas, rng, (hx, hy, hx + int(rng.integers(2, 5)), hy + int(rng.integers(2, 4))), roofs, 6.0)
                     if rng.random() < 0.4:
                         wood[hy + 3 : hy + 5, hx - 2 : hx] = 1.0
-    for _ in range(30):  # farms: barns and a house
+    for _ in range(44):  # farms: barns and a house
         x, y = (int(value) for value in rng.integers(20, _SIZE_PX - 30, 2))
         barn = (x, y, x + int(rng.integers(5, 12)), y + int(rng.integers(3, 6)))
-        _house(canvas, rng, barn, (_RED_ROOF,) if rng.random() < 0.25 else _HALLS, 7.0)
+        _house(canvas, rng, barn, (_RED_ROOF,) if rng.random() < 0.45 else _HALLS, 7.0)
         _house(canvas, rng, (x - 5, y + 1, x - 2, y + 4), roofs, 6.0)
         wood[y - 4 : y - 1, x - 6 : x + 3] = 1.0
         canvas.lamps_px.append((x + 2.0, y + 6.0))
@@ -471,7 +476,7 @@ def _industry(canvas: _Canvas, rng: np.random.Generator, block: Rectangle) -> No
     for area, _ in _parcels(rng, 18, 40, block):
         x0, y0, x1, y1 = area
         if rng.random() < 0.7 and min(x1 - x0, y1 - y0) > 8:
-            color = _RED_ROOF if rng.random() < 0.02 else _HALLS[int(rng.integers(len(_HALLS)))]
+            color = _RED_ROOF if rng.random() < 0.04 else _HALLS[int(rng.integers(len(_HALLS)))]
             canvas.fill((x0 + 2, y0 + 2, x1 - 2, y1 - 2), np.array(color) * rng.uniform(0.85, 1.1), 9.0)
 
 

@@ -23,9 +23,10 @@ from scenes.sky.photometry import Radiance
 _WATER_INDEX = 1.34
 _SEED = 5
 _TILE_PX, _TILE_TEXEL_M = 1024, 2.0
-_LONGEST_WAVE_M, _SHORTEST_WAVE_M = 75.0, 4.0
+_LONGEST_WAVE_M, _SHORTEST_WAVE_M = 130.0, 4.0
 # Slope variance is even over the octaves from gravity waves to ripples; the longest 4 of about 13 are resolved.
 _RESOLVED_SHARE = 0.3
+_GUSTINESS = 0.3  # standard deviation of the slopes' variance over patches of wind, our choice
 _FOAM_REFLECTANCE = 0.35  # fresh and fading foam, Koepke 1984 (doi:10.1364/AO.23.001816)
 _FOAM_PATCHES = 0.01  # share of the tile under foam patches
 _TABLE_ROWS, _TABLE_COLUMNS = 20, 36
@@ -105,16 +106,22 @@ def _wave_tile() -> MipTile:
     )
     k = np.hypot(k1, k2)
     safe = np.maximum(k, 1e-9)
-    # Equal slope variance in every octave: the height's amplitude goes as k^-2 in two dimensions.
+    # Slope variance falls a little from octave to octave: the height's amplitude goes as k^-2.3 in two dimensions.
     band = np.exp(-((1.0 / (safe * _LONGEST_WAVE_M)) ** 4)) * (k < 1.0 / _SHORTEST_WAVE_M)
     spread = np.sqrt(0.25 + (k2 / safe) ** 4)
-    height = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX))) * np.where(k > 0, band * spread / safe**2, 0.0)
+    height = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX))) * np.where(k > 0, band * spread / safe**2.3, 0.0)
     size = (_TILE_PX, _TILE_PX)
     along, across = np.fft.irfft2(1j * k2 * height, s=size), np.fft.irfft2(1j * k1 * height, s=size)
     scale = 1.0 / np.sqrt(along.var() + across.var())
     noise = power_noise(_SEED, "foam", _TILE_PX, 0.9, 60.0)
     foam = noise > np.quantile(noise, 1.0 - _FOAM_PATCHES)
     return MipTile(np.stack([along * scale, across * scale, foam], axis=-1).astype(np.float32), _TILE_TEXEL_M)
+
+
+@lru_cache(maxsize=1)
+def _gust_tile() -> MipTile:
+    """Cat's paws and slicks between 20 m and 2 km, of unit variance."""
+    return MipTile(power_noise(_SEED, "gusts", 512, 1.5, 5.0)[..., None], 8.0)
 
 
 class Sea:
@@ -144,6 +151,11 @@ class Sea:
         cosine, sine = self._wind
         ones, zeros = np.ones_like(view.x_m), np.zeros_like(view.x_m)
         waves = view.average(_wave_tile(), axes=Axes(cosine, sine, ones, zeros, zeros))[0]
+        # Patches of wind are drawn out along it.
+        u, v = cosine * view.x_m + sine * view.y_m, cosine * view.y_m - sine * view.x_m
+        width_m = np.sqrt(view.across_m * view.along_m)
+        paws = _gust_tile().sample(np.float32(0.4) * u, v, width_m)[..., 0]
+        gusts = gusts * np.clip(1.0 + np.float32(_GUSTINESS) * paws, 0.25, 2.2)
         size = np.float32(np.sqrt(_RESOLVED_SHARE * (self._along + self._across))) * np.sqrt(gusts)
         slope_x = size * (cosine * waves[..., 0] - sine * waves[..., 1])
         slope_y = size * (sine * waves[..., 0] + cosine * waves[..., 1])

@@ -23,7 +23,7 @@ _SLOPES: dict[GroundKind, float] = {
     "fields": 0.035,
     "coast": 0.05,
     "town": 0.02,
-    "mountains": 0.42,
+    "mountains": 0.55,
     "snow": 0.16,
     "airfield": 0.035,
 }
@@ -31,11 +31,13 @@ _SLOPES: dict[GroundKind, float] = {
 _FINER_SIZE, _FINER_HEIGHT = 1.0 / 6.3, 0.075
 _RIDGED: tuple[GroundKind, ...] = ("mountains", "dry")
 # Heights stay below this share of the camera's altitude, and farther away below a cone that rises so much more.
-_BELOW_CAMERA, _CONE = 0.45, 0.10
+_BELOW_CAMERA, _CONE = 0.45, 0.20
 # Rays that fall more steeply meet hills too gentle to hide anything.
 _STEEP_SINE = 0.45
 _STEPS, _COVERED_STEPS, _MOST_COLUMNS, _FAR_M = 256, 640, 1500, 1.6e5
 _COARSE_PX = 8
+# No trees or houses are closer to the camera than this.
+_NEAREST_COVER_M = 100.0
 
 Heights = Callable[[Field, Field, Field], Field]
 
@@ -115,8 +117,8 @@ class Terrain:
             gain = gain * self._kept(x_m, y_m)
             height = gain * seen[..., 0]
         limit = np.float32(_BELOW_CAMERA * self._altitude_m) + np.float32(_CONE) * np.hypot(x_m, y_m)
-        bent = 1.0 / (1.0 + np.abs(height) / limit)
-        return height * bent, (gain * bent * bent)[..., None] * seen[..., 1:]
+        bent = 1.0 / np.sqrt(1.0 + (height / limit) ** 2)
+        return height * bent, (gain * bent * bent * bent)[..., None] * seen[..., 1:]
 
     def seen(
         self,
@@ -242,7 +244,11 @@ def highest_sine(kind: GroundKind, altitude_m: float, cover_m: float) -> float:
     """Sine of the elevation above which no land rises, nor what is up to `cover_m` high on it. [m]"""
     if kind not in _SLOPES:
         return -1.0
-    return _CONE + cover_m / ((1.0 - _BELOW_CAMERA) * altitude_m)
+    tile, deviation = _relief(kind in _RIDGED)
+    top_m = _SLOPES[kind] / deviation * (tile.most + _FINER_HEIGHT * tile.most) + cover_m
+    nearest_m = max(top_m - _BELOW_CAMERA * altitude_m, 1.0) / _CONE
+    hills = min(max(top_m - altitude_m, 0.0) / nearest_m, _CONE)
+    return hills + max(cover_m - (1.0 - _BELOW_CAMERA) * altitude_m, 0.0) / _NEAREST_COVER_M
 
 
 def _enlarged(coarse: Field, every: int, shape: tuple[int, int]) -> Field:

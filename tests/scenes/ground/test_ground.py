@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.types.environment import GROUND_KINDS, Environment
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
-from scenes.ground.land_tiles import land_tile
+from scenes.ground.land_tiles import land_textures
 from scenes.ground.sea import GroundLight, Sea, fresnel, slope_variances
 from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad, power_noise
 from scenes.sky.photometry import luminance
@@ -64,9 +64,10 @@ def test_land_reflects_what_it_should_on_average(kind: str) -> None:
     """Over many kilometres the picture averages to the environment's reflectance."""
     above = rays(50.0, 25.0)
     lit = light()
-    mean = Ground(environment(kind), lit).radiance(above).mean(axis=(0, 1))
+    seen = [Ground(environment(kind, ground_texture_seed=seed), lit).radiance(above) for seed in range(6)]
+    mean = np.mean(seen, axis=(0, 1, 2))
     want = np.array(MEAN_REFLECTANCE[kind]) * lit.level_lux / np.pi
-    # A view of 6 km holds a few hundred parcels and hills of a few kilometres: about a tenth either way.
+    # Six views of 6 km hold a thousand parcels, but few large woods, rivers and hills: about a tenth either way.
     np.testing.assert_allclose(mean, want, rtol=0.15)
 
 
@@ -88,7 +89,7 @@ def test_a_tile_is_averaged_over_the_footprint() -> None:
 
 
 def test_a_tile_repeats_without_a_seam() -> None:
-    tile = land_tile("fields")
+    tile = land_textures("fields").rgb
     x = np.linspace(8192 - 40, 8192 + 40, 81, dtype=np.float32)[None].repeat(3, axis=0)
     y = np.full_like(x, 777.0)
     width = np.full_like(x, 16.0)
@@ -186,7 +187,7 @@ def test_red_things_lie_about() -> None:
     near = rays(45.0, 10.0, 400, 400)
     for kind in ("town", "fields"):
         shares = []
-        for seed in range(4):
+        for seed in range(8):
             seen = Ground(environment(kind, altitude_m=4000.0, ground_texture_seed=seed), light()).radiance(near)
             shares.append(((seen[..., 0] > 3 * seen[..., 1]) & (seen[..., 0] > 3 * seen[..., 2])).mean())
         assert max(shares) > 0

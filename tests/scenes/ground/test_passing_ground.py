@@ -66,7 +66,8 @@ def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind: str, f
     # The same places: so many whole pixels apart the pictures are the same but for the rounding of places in float32.
     columns, rows = np.rint(FOCAL_PX * np.array(flown_m) / 1500.0).astype(int)
     shifted = np.roll(after, (rows, columns), axis=(0, 1))[40:-40, 40:-40]
-    assert np.abs(shifted - before[40:-40, 40:-40]).mean() < 0.02 * before.std()
+    # Wooded hills of 25 m move by a few hundredths of a pixel more or less than the plain.
+    assert np.abs(shifted - before[40:-40, 40:-40]).mean() < 0.08 * before.std()
 
 
 def test_ships_are_passed_as_the_sea_is() -> None:
