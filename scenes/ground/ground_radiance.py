@@ -46,7 +46,7 @@ _HAZY, _HAZY_STEP_PX = 0.5, 2
 # Rays farther apart than this see no hills.
 _COARSE_RAD = 0.012
 # No trees or houses closer than this under a low camera.
-_CLEARING_M, _CLEARING_EDGE_M = 110.0, 30.0
+_CLEARING_M, _CLEARING_RAGGED_M, _CLEARING_EDGE_M = 330.0, 70.0, 25.0
 _TALLEST_M = 30.0
 _MEADOW = np.array([0.070, 0.090, 0.038], dtype=np.float32)
 # Illuminance below which towns switch on their lamps.
@@ -252,9 +252,15 @@ class Ground:
         cover = np.minimum(cover, np.float32(_TALLEST_M))
         if self._airfield is not None:
             return self._airfield.height_m(cover, x_m, y_m)
-        away_m = np.hypot(x_m, y_m)
-        result: Field = cover * np.clip((away_m - np.float32(_CLEARING_M)) / np.float32(_CLEARING_EDGE_M), 0.0, 1.0)
+        result: Field = cover * (1.0 - self._clearing(view))
         return result
+
+    def _clearing(self, view: GroundView) -> Field:
+        """(H, W) share of meadow around the place over which a low camera flies."""
+        edge_m = np.float32(_CLEARING_M) + np.float32(_CLEARING_RAGGED_M) * self._cover.patches(view)
+        away_m = np.hypot(view.x_m, view.y_m)
+        share: Field = np.clip((edge_m - away_m) / np.float32(_CLEARING_EDGE_M) + 1.0, 0.0, 1.0)
+        return share
 
     def _block(self, view: GroundView, regions: Regions, seen: Seen | None) -> Radiance:
         gusts = np.clip(
@@ -296,9 +302,8 @@ class Ground:
             albedo, sunlit = self._airfield.drawn_on(albedo, sunlit, view, self._cover.detail(view))
         elif self._is_low and self._kind != "snow":
             # Under a low camera there is no wood.
-            away_m = np.hypot(view.x_m, view.y_m)
-            share = np.clip((np.float32(_CLEARING_M) - away_m) / np.float32(_CLEARING_EDGE_M) + 1.0, 0.0, 1.0)
-            dark = np.clip(2.0 - albedo.mean(axis=-1) / np.float32(0.035), 0.0, 1.0)
+            share = self._clearing(view)
+            dark = np.clip(2.0 - albedo.mean(axis=-1) / np.float32(0.035), 0.0, 1.0) if self._kind != "town" else share
             meadow = _MEADOW * self._cover.detail(view)[..., None]
             albedo = albedo + (share * dark)[..., None] * (meadow - albedo)
             sunlit = sunlit + share * (1.0 - sunlit)

@@ -51,7 +51,7 @@ _TOWN_ABOVE, _TOWN_EDGE = -0.45, 0.12
 # Texels of one tile of detail at several sizes, and its strength there; seen from low altitude.
 _DETAIL: tuple[tuple[float, float], ...] = ((2.3, 0.06), (0.55, 0.075), (0.127, 0.075), (0.031, 0.08))
 _DETAIL_SPAN = 3.0
-_CROWN_TEXEL_M = 0.6
+_CROWN_TEXEL_M, _PATCH_TEXEL_M = 0.6, 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +280,11 @@ class LandCover:
         scale = np.float32(1.0 / _CROWN_TEXEL_M)
         return _detail().sample(view.x_m * scale, view.y_m * scale, view.across_m * scale)[..., 0]
 
+    def patches(self, view: GroundView) -> Field:
+        """(H, W) ragged forms of some 200 m, of unit variance."""
+        scale = np.float32(1.0 / _PATCH_TEXEL_M)
+        return _detail().sample(view.x_m * scale, view.y_m * scale, view.across_m * scale)[..., 0]
+
     def detail(self, view: GroundView) -> Field:
         """(H, W) factor of unit mean: tufts and clods."""
         finest_m = float(view.across_m.min())
@@ -297,7 +302,7 @@ class LandCover:
         return result
 
 
-LOW_M = 250.0
+LOW_M = 150.0
 """Altitude below which trees and houses stand up from the ground. [m]"""
 
 
