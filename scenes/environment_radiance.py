@@ -93,9 +93,7 @@ class EnvironmentRadiance:
             sky, horizon = self.clear_radiance(directions)
         return self._layered(directions, sky, horizon, has_ground=True)
 
-    def _layered(
-        self, directions: NDArray[np.float32], sky: Radiance, horizon: Radiance, has_ground: bool
-    ) -> Radiance:
+    def _layered(self, directions: NDArray[np.float32], sky: Radiance, horizon: Radiance, has_ground: bool) -> Radiance:
         total = sky.copy()
         layers = sorted(self.environment.clouds, key=lambda layer: -abs(layer.height_above_camera_m))
         lowest = self.air.round_horizon_sine or 0.0

@@ -80,7 +80,8 @@ class Airfield:
     def hill_share(self, x_m: Field, y_m: Field) -> Field:
         """(H, W) how much of their height hills keep: the field is level."""
         away_m = np.hypot(x_m, y_m)
-        return np.clip((away_m - np.float32(_LEVEL_M)) / np.float32(_LEVEL_M), 0.0, 1.0)
+        share: Field = np.clip((away_m - np.float32(_LEVEL_M)) / np.float32(_LEVEL_M), 0.0, 1.0)
+        return share
 
     def drawn_on(self, albedo: Field, sunlit: Field, view: GroundView, detail: Field) -> tuple[Field, Field]:
         """Reflectance and sunlight with the airfield's mown grass, pavement, paint and halls over them."""
@@ -88,7 +89,9 @@ class Airfield:
         if float(np.hypot(view.x_m, view.y_m).min()) > 2.0 * self._half_length_m + self._middle_m:
             return albedo, sunlit
         blur_m = self._blur_m(view)
-        field = inside_share(along, self._half_length_m + _MARGIN_M, blur_m[0]) * inside_share(across, _FIELD_M, blur_m[1])
+        field = inside_share(along, self._half_length_m + _MARGIN_M, blur_m[0]) * inside_share(
+            across, _FIELD_M, blur_m[1]
+        )
         grass = np.array([0.075, 0.098, 0.042], dtype=np.float32)
         stripes = np.clip(4.0 * np.sin(across * np.float32(np.pi / _MOWN_M)), -1.0, 1.0)
         stripes = stripes * np.exp(-((blur_m[1] / np.float32(0.5 * _MOWN_M)) ** 2))
@@ -117,7 +120,7 @@ class Airfield:
             for index in np.arange(1.5, self._half_width_m / 1.8 - 1.0):
                 both = inside_share(np.abs(across) - np.float32(1.8 * index), 0.9 if index % 2 else 0.0, blur_m[1])
                 paint = paint + bars * both
-        return np.minimum(paint, np.float32(0.9))
+        return np.asarray(np.minimum(paint, 0.9), dtype=np.float32)
 
     def _places(self, x_m: Field, y_m: Field) -> tuple[Field, Field]:
         along = self._cosine * x_m + self._sine * y_m - np.float32(self._middle_m)

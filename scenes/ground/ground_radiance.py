@@ -171,9 +171,7 @@ class Ground:
         environment = self._environment
         if seen is not None:
             return view_at(directions, seen.distance_m, seen.sine, angle_rad, environment.camera_offset_m)
-        return ground_view(
-            directions, environment.altitude_m, angle_rad, environment.camera_offset_m, self._is_round
-        )
+        return ground_view(directions, environment.altitude_m, angle_rad, environment.camera_offset_m, self._is_round)
 
     @property
     def _mean_radiance(self) -> NDArray[np.float32]:
@@ -362,7 +360,7 @@ def _open_share(layer: CloudLayer) -> float:
 
 
 def _square_centers(directions: Field, every: int) -> Field:
-    """(H / every, W / every, C) directions or other values at the centres of squares of rays, rounded up; `every` is even."""
+    """(H / every, W / every, C) directions or values at centres of squares of rays, rounded up; `every` is even."""
     for axis in (0, 1):
         last = directions.shape[axis] - 1
         first = np.arange(every // 2 - 1, last + every // 2, every)

@@ -309,7 +309,8 @@ LOW_M = 150.0
 def _weights(tangent: float) -> NDArray[np.float32]:
     """(3,) weights of the stored shares of light for one tangent of the sun's elevation."""
     place = float(np.interp(np.log(max(tangent, 1e-3)), np.log(SUN_TANGENTS), np.arange(len(SUN_TANGENTS))))
-    return np.maximum(1.0 - np.abs(np.arange(len(SUN_TANGENTS)) - place), 0.0).astype(np.float32)
+    weights = np.maximum(1.0 - np.abs(np.arange(len(SUN_TANGENTS)) - place), 0.0)
+    return np.asarray(weights, dtype=np.float32)
 
 
 def _ramp(value: Field, low: float, high: float) -> Field:

@@ -29,22 +29,17 @@ BEAM_SCALE = 3.0
 HEIGHT_SCALE_M = 40.0
 """What the value 1 of a stored share stands for."""
 
-_SIZE_PX, _TEXEL_M = 2048, 4.0
-_TOWN_TEXEL_M = 2.5
+_SIZE_PX = 2048
+_TEXELS_M: dict[LandKind, float] = {"fields": 4.0, "forest": 4.0, "dry": 4.0, "town": 2.5}
 _SEED = 4
 _SHADOW_STEPS_PX = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22)
-# Trees let light through and are round: slopes of the canopy count by this share.
-_CANOPY_SLOPE = 0.55
+_CANOPY_SLOPE = 0.55  # trees let light through: slopes of the canopy count by this share
 
 _CROPS: tuple[tuple[float, Rgb], ...] = (
-    (0.17, (0.165, 0.135, 0.075)),  # ripe grain
-    (0.24, (0.062, 0.090, 0.032)),
-    (0.26, (0.078, 0.104, 0.044)),  # grass
-    (0.12, (0.046, 0.070, 0.026)),
-    (0.11, (0.112, 0.086, 0.062)),  # ploughed
-    (0.09, (0.150, 0.124, 0.086)),  # stubble
-    (0.01, (0.215, 0.200, 0.052)),  # rape in flower
-)
+    (0.17, (0.165, 0.135, 0.075)), (0.24, (0.062, 0.090, 0.032)), (0.26, (0.078, 0.104, 0.044)),
+    (0.12, (0.046, 0.070, 0.026)), (0.11, (0.112, 0.086, 0.062)), (0.09, (0.150, 0.124, 0.086)),
+    (0.01, (0.215, 0.200, 0.052)),
+)  # fmt: skip
 _WOOD: Rgb = (0.025, 0.036, 0.017)
 _ROAD: Rgb = (0.145, 0.138, 0.125)
 _ASPHALT: Rgb = (0.088, 0.087, 0.086)
@@ -61,10 +56,8 @@ LAMP_CD = 260.0
 """Mean intensity of a street lamp with the street that it lights, seen from above. [cd]"""
 # Sodium, warm and neutral white, and their shares.
 _LAMP_RGB: tuple[tuple[float, Rgb], ...] = (
-    (0.62, (1.55, 0.90, 0.28)),
-    (0.90, (1.22, 0.97, 0.62)),
-    (1.0, (0.93, 1.0, 1.10)),
-)
+    (0.62, (1.55, 0.90, 0.28)), (0.90, (1.22, 0.97, 0.62)), (1.0, (0.93, 1.0, 1.10)),
+)  # fmt: skip
 _LAMP_SPREAD = 0.9  # standard deviation of the logarithm of their intensities
 LAMP_PEAK_CD_M2 = 300.0
 """Radiance of the value 1 of a texture of lamps. [cd/m2]"""
@@ -136,7 +129,7 @@ def land_textures(kind: LandKind) -> LandTextures:
 @lru_cache(maxsize=2)
 def lamp_texture(kind: LandKind) -> MipTile:
     """(3 channels) radiance of street lamps at night over `LAMP_PEAK_CD_M2`; colour and intensity differ by lamp."""
-    land, texel_m = land_textures(kind), _texel_m(kind)
+    land, texel_m = land_textures(kind), _TEXELS_M[kind]
     rng = frame_generator(_SEED, 0, f"lamps {kind}")
     light = np.zeros((_SIZE_PX, _SIZE_PX, 3), dtype=np.float32)
     shares = [share for share, _ in _LAMP_RGB]
@@ -162,10 +155,6 @@ def lamp_texture(kind: LandKind) -> MipTile:
     return MipTile(np.clip(light, 0.0, 1.0), texel_m, coded=True)
 
 
-def _texel_m(kind: LandKind) -> float:
-    return _TOWN_TEXEL_M if kind == "town" else _TEXEL_M
-
-
 def _canvas(kind: LandKind) -> _Canvas:
     paint = {"fields": _paint_fields, "forest": _paint_forest, "dry": _paint_dry, "town": _paint_town}[kind]
     shape = (_SIZE_PX, _SIZE_PX)
@@ -173,7 +162,7 @@ def _canvas(kind: LandKind) -> _Canvas:
         np.zeros((*shape, 3), dtype=np.float32),
         np.zeros(shape, dtype=np.float32),
         np.full(shape, 0.5, dtype=np.float32),
-        _texel_m(kind),
+        _TEXELS_M[kind],
     )
     paint(empty, frame_generator(_SEED, 0, f"paint {kind}"))
     return empty
@@ -368,7 +357,8 @@ def _villages(canvas: _Canvas, wood: Field, blocks: list[Rectangle], rng: np.ran
                     wood[garden[1] : garden[3], garden[0] : garden[2]] *= 0.2
                     if rng.random() < 0.5:
                         canvas.rgb[hy - 2 : hy + 4, hx - 2 : hx + 4] = np.array(_CROPS[2][1]) * rng.uniform(0.7, 1.0)
-                    _house(canvas, rng, (hx, hy, hx + int(rng.integers(2, 5)), hy + int(rng.integers(2, 4))), roofs, 6.0)
+                    area = (hx, hy, hx + int(rng.integers(2, 5)), hy + int(rng.integers(2, 4)))
+                    _house(canvas, rng, area, roofs, 6.0)
                     if rng.random() < 0.4:
                         wood[hy + 3 : hy + 5, hx - 2 : hx] = 1.0
     for _ in range(44):  # farms: barns and a house
@@ -492,7 +482,7 @@ def _rows(
     x0, y0, x1, y1 = block
     setback = 1 if gap_px else 0
     color = tuple(np.array(roof[0][int(rng.integers(len(roof[0])))]) * rng.uniform(0.9, 1.1))
-    family = (color, color, roof[0][0])  # type: ignore[arg-type]
+    family = (color, color, roof[0][0])
     for is_column in (False, True):
         low, high = (y0, y1) if is_column else (x0, x1)
         near, far = (x0, x1) if is_column else (y0, y1)

@@ -323,7 +323,7 @@ def _widths(view: GroundView, cosine: np.float32, sine: np.float32) -> tuple[Fie
     return along * view.along_m + across * view.across_m, across * view.along_m + along * view.across_m
 
 
-def inside_share(place_m: Field, half_m: Field | float, blur_m: Field) -> Field:
+def inside_share(place_m: Field, half_m: Field | np.floating[Any] | float, blur_m: Field) -> Field:
     """(H, W) share of each piece of sea within a distance of a line."""
     low = np.maximum(place_m - blur_m / 2, -half_m)
     high = np.minimum(place_m + blur_m / 2, half_m)

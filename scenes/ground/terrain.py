@@ -46,14 +46,12 @@ Heights = Callable[[Field, Field, Field], Field]
 def _relief(ridged: bool) -> tuple[MipTile, float]:
     """Heights of zero mean and unit variance with slopes east and north [1/m], and the slope's deviation. [1/m]"""
     if ridged:
-        folds = [np.abs(power_noise(_SEED, f"ridge {index}", _SIZE_PX, 2.4, cycles)) for index, cycles in ((0, 5), (1, 9))]
+        folds = [np.abs(power_noise(_SEED, f"ridge {cycles}", _SIZE_PX, 2.4, cycles)) for cycles in (5.0, 9.0)]
         height = -folds[0] - np.float32(0.45) * folds[1] * (np.float32(1.6) - np.minimum(folds[0], np.float32(1.6)))
         height = (height - height.mean()) / height.std()
     else:
         height = power_noise(_SEED, "terrain", _SIZE_PX, 2.5, 7.0)
-    slopes = [
-        (np.roll(height, -1, axis) - np.roll(height, 1, axis)) / np.float32(2 * _TEXEL_M) for axis in (1, 0)
-    ]
+    slopes = [(np.roll(height, -1, axis) - np.roll(height, 1, axis)) / np.float32(2 * _TEXEL_M) for axis in (1, 0)]
     deviation = float(np.sqrt(np.mean(slopes[0] ** 2 + slopes[1] ** 2) / 2))
     return MipTile(np.stack([height, *slopes], axis=-1).astype(np.float32), _TEXEL_M), deviation
 
@@ -196,8 +194,8 @@ class Terrain:
         wanted = low + angle_rad * np.arange(rows)
         table = np.empty((columns, rows, 2), dtype=np.float32)
         nearness = 1.0 / distances
-        for column in range(columns):
-            table[column, :, 0] = np.interp(wanted, highest[column], nearness)
+        for index in range(columns):
+            table[index, :, 0] = np.interp(wanted, highest[index], nearness)
         falls = np.abs(np.diff(table[..., 0], axis=1))
         # Across an outline only the nearer side counts.
         table[:, 1:-1, 1] = np.minimum(falls[:, :-1], falls[:, 1:])
@@ -255,4 +253,5 @@ def _enlarged(coarse: Field, every: int, shape: tuple[int, int]) -> Field:
     """A grid whose points are `every` pixels apart, from the first pixel on, enlarged to (H, W)."""
     v = np.arange(shape[0], dtype=np.float32)[:, None] / np.float32(every)
     u = np.arange(shape[1], dtype=np.float32)[None, :] / np.float32(every)
-    return np.asarray(sample_bilinear(coarse, *np.broadcast_arrays(u, v), cv2.BORDER_REPLICATE), dtype=np.float32)
+    columns, rows = np.broadcast_to(u, shape), np.broadcast_to(v, shape)
+    return np.asarray(sample_bilinear(coarse, columns, rows, cv2.BORDER_REPLICATE), dtype=np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ _SEEDS = (3, 11)
 _VIEWS = ((30.0, -6.0), (1000.0, -12.0), (6000.0, -24.0))
 
 
-def lag_correlation(patch: NDArray[np.floating], lag_px: int = _LAG_PX) -> float:
+def lag_correlation(patch: NDArray[np.floating[Any]], lag_px: int = _LAG_PX) -> float:
     """Mean correlation of a (H, W) patch with itself shifted across and down; 0 for white noise.
 
     A plane is subtracted first, so that a gradient of light is no form.
@@ -38,7 +39,7 @@ def lag_correlation(patch: NDArray[np.floating], lag_px: int = _LAG_PX) -> float
     return 0.5 * (across + down) / max(variance, 1e-30)
 
 
-def noise_patches(image: NDArray[np.floating]) -> tuple[int, int]:
+def noise_patches(image: NDArray[np.floating[Any]]) -> tuple[int, int]:
     """Numbers of patches of a (H, W) image of luminance that are noise, and of those that show something.
 
     A patch shows something when its deviation is 0.4 % of its mean or more; it is noise when its correlation at 8 px
@@ -108,7 +109,8 @@ def _rays(pitch_deg: float) -> NDArray[np.float32]:
     u, v = np.meshgrid(np.arange(_WIDTH_PX) - (_WIDTH_PX - 1) / 2, np.arange(_HEIGHT_PX) - (_HEIGHT_PX - 1) / 2)
     cosine, sine = np.cos(np.radians(pitch_deg)), np.sin(np.radians(pitch_deg))
     rays = np.stack([cosine * _FOCAL_PX + sine * v, -u, sine * _FOCAL_PX - cosine * v], axis=-1)
-    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    result: NDArray[np.float32] = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return result
 
 
 def ground_table(kinds: tuple[GroundKind, ...]) -> str:
