@@ -42,6 +42,8 @@ _COVER_SAMPLES, _MOST_THRESHOLD, _THRESHOLD_BISECTIONS = 96, 12.0, 14
 _WIDEST_AT = {HEAP: 0.14, SHEET: 0.45, CELLS: 0.5}
 # With this as the smallest detail only the larger shape is left. [m]
 _LARGER_SHAPE_M = 1e6
+# Width of a shadow's edge in units of the larger shape.
+_SHADOW_EDGE = 0.22
 _CREASE, _THIN, _RIM = 0.45, 0.75, 0.45
 # Steps between the first and the second rays of a large picture, and how much of the way to the nearest cloud around
 # is free of it.
@@ -187,6 +189,22 @@ class CloudShape:
 def cloud_shape(layer: CloudLayer) -> CloudShape:
     """The shape of a layer with depth."""
     return CloudShape(layer)
+
+
+def cloud_share(layer: CloudLayer, east_m: _Field, north_m: _Field) -> _Field:
+    """(H, W) share of the vertical through places in a layer's plan that is cloud, with soft edges.
+
+    Args:
+        layer: of none of `THIN_KINDS`.
+        east_m, north_m: (H, W) places, from the layer's origin. [m]
+    """
+    shape = cloud_shape(layer)
+    numbers = shape.numbers
+    height_m = np.full(east_m.size, _WIDEST_AT[int(numbers[0])] * numbers[2])
+    places_m = np.stack([east_m.ravel(), north_m.ravel(), height_m], axis=-1).astype(np.float64)
+    excess_m = layer_excess(numbers, shape.body, shape.lumps, places_m, _LARGER_SHAPE_M) - 0.3 * numbers[11]
+    share: _Field = np.clip(excess_m / (_SHADOW_EDGE * numbers[4]) + 0.5, 0.0, 1.0).astype(np.float32)
+    return share.reshape(east_m.shape)
 
 
 @dataclass(frozen=True, eq=False)

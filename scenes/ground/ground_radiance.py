@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import CloudLayer, Environment, GroundKind
 from drogue_models.frozen_model import ReflectanceRgb
-from scenes.clouds.cloud_density import CloudDensity
+from scenes.clouds.cloud_layers import THIN_KINDS, cloud_share
 from scenes.clouds.ray_march import upsample
 from scenes.ground.airfield import Airfield
 from scenes.ground.coast import Coast
@@ -53,7 +53,6 @@ _MEADOW = np.array([0.070, 0.090, 0.038], dtype=np.float32)
 _LAMPS_ON_LUX = 40.0
 # Beam left by clouds below which the ground has no shadows of clouds.
 _OVERCAST = 0.03
-_CLOUD_EDGE = 0.22
 
 
 class Ground:
@@ -216,21 +215,13 @@ class Ground:
         if to_beam[2] <= 0.05:
             return sunny
         for layer in self._environment.clouds:
-            if layer.kind == "cirrus" or _open_share(layer) < _OVERCAST:
+            if layer.kind in THIN_KINDS or _open_share(layer) < _OVERCAST:
                 continue
             middle_m = layer.height_above_camera_m + layer.thickness_m * (0.25 if layer.is_above else -0.75)
             way_m = (middle_m + self._environment.altitude_m) / to_beam[2]
             if way_m <= 0:
                 continue
-            place = np.stack(
-                [
-                    x_m + np.float32(way_m * to_beam[0]),
-                    y_m + np.float32(way_m * to_beam[1]),
-                    np.full_like(x_m, middle_m),
-                ],
-                axis=-1,
-            )
-            inside = np.clip(CloudDensity(layer).excess_at(place) / np.float32(_CLOUD_EDGE) + 0.5, 0.0, 1.0)
+            inside = cloud_share(layer, x_m + np.float32(way_m * to_beam[0]), y_m + np.float32(way_m * to_beam[1]))
             through = 1.0 - inside * np.float32(1.0 - np.exp(-layer.optical_depth))
             sunny *= through / np.float32(_open_share(layer))
         return np.minimum(sunny, np.float32(2.5))
