@@ -5,6 +5,7 @@ Streams are numpy's `SeedSequence` over 32-bit words: a seed takes two, a name o
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from collections.abc import Sequence
 
@@ -40,6 +41,17 @@ def seeded_generator(seed: int, *names: str) -> np.random.Generator:
         ValueError: a negative seed.
     """
     return np.random.Generator(np.random.Philox(_sequence(seed, [_name_word(name) for name in names])))
+
+
+def stream_seed(seed: int, name: str) -> int:
+    """A seed of its own for each pair of a seed and a name, in [0, 2^52), which every reader of JSON keeps.
+
+    Raises:
+        ValueError: a negative seed.
+    """
+    if seed < 0:
+        raise ValueError(f"seed: must not be negative, got {seed}")
+    return int.from_bytes(hashlib.sha256(f"{seed} {name}".encode()).digest()[:8], "big") >> 12
 
 
 def sample_generator(seed: int, epoch: int, sample: int, stream: str) -> np.random.Generator:

@@ -31,7 +31,7 @@ def camera_of_scene(recipe: Recipe, scene_id: int) -> tuple[Sensor, VideoCamera 
         return sensor, None
     # A stream for each part: a new key of one changes none of the others.
     lens_rng, window_rng, processing_rng, coding_rng, overlay_rng = (
-        frame_generator(recipe.seed, scene_id, f"camera {part}")
+        frame_generator(recipe.stream_seed, scene_id, f"camera {part}")
         for part in ("lens", "window", "processing", "coding", "overlay")
     )
     sensor, flaws, spectrum = _sample_lens(lens_rng, ranges, sensor)

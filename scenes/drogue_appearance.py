@@ -24,13 +24,13 @@ def drogue_of_scene(recipe: Recipe, scene_id: int) -> DrogueParameters:
     if recipe.frames.in_turn:
         return variants[scene_id // max(len(recipe.families), 1) % len(variants)].drogue
     shares = np.cumsum([variant.weight for variant in variants])
-    place = frame_generator(recipe.seed, scene_id, "drogue variant").random() * shares[-1]
+    place = frame_generator(recipe.stream_seed, scene_id, "drogue variant").random() * shares[-1]
     return variants[int(np.searchsorted(shares, place, side="right"))].drogue
 
 
 def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) -> DrogueCondition | None:
     """The condition of a scene's drogue, or None when it is as new."""
-    rng, ranges = frame_generator(recipe.seed, scene_id, "drogue condition"), recipe.target
+    rng, ranges = frame_generator(recipe.stream_seed, scene_id, "drogue condition"), recipe.target
     missing = rng.random(drogue.marker_count) < ranges.missing_marker_fraction
     spared = rng.permutation(drogue.marker_count)[:_FEWEST_MARKERS]
     missing[spared] = False
@@ -40,7 +40,7 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
         markers=markers,
         hub=hub,
         body_reflectance_fraction=sample_uniform(rng, ranges.body_reflectance_fraction),
-        wear=None if ranges.wear is None else _wear_of_scene(recipe.seed, scene_id, ranges.wear),
+        wear=None if ranges.wear is None else _wear_of_scene(recipe.stream_seed, scene_id, ranges.wear),
     )
     as_new = DrogueCondition(markers=(SurfaceCondition(),) * drogue.marker_count)
     return None if condition == as_new else condition

@@ -49,7 +49,7 @@ def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
         unit = frame_index // recipe.sequence.frames_per_sequence
     if recipe.frames.in_turn:
         return unit % scenes
-    order = frame_generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
+    order = frame_generator(recipe.stream_seed, unit // scenes, "scene order").permutation(scenes)
     return int(order[unit % scenes])
 
 
@@ -64,7 +64,7 @@ def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
     if recipe.frames.in_turn:
         return recipe.families[scene_id % len(recipe.families)]
     scenes = recipe.frames.scenes
-    place = int(np.flatnonzero(frame_generator(recipe.seed, 0, "families").permutation(scenes) == scene_id)[0])
+    place = int(np.flatnonzero(frame_generator(recipe.stream_seed, 0, "families").permutation(scenes) == scene_id)[0])
     ends = np.cumsum(scenes_per_family(recipe))
     return recipe.families[int(np.searchsorted(ends, place, side="right"))]
 
@@ -103,7 +103,7 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
 def split_of_scenes(recipe: Recipe) -> dict[int, SplitName]:
     """The split of every scene: shares of the scenes in a drawn order, rounded to whole scenes."""
     scenes = recipe.frames.scenes
-    order = frame_generator(recipe.seed, 0, "split").permutation(scenes).tolist()
+    order = frame_generator(recipe.stream_seed, 0, "split").permutation(scenes).tolist()
     train_end = round(recipe.split.train * scenes)
     val_end = round((recipe.split.train + recipe.split.val) * scenes)
     return {
@@ -124,7 +124,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     """
     if not 0 <= frame_index < recipe.frames.count:
         raise ValueError(f"frame: must be in [0, {recipe.frames.count}), got {frame_index}")
-    seed = recipe.seed
+    seed = recipe.stream_seed
     scene_id = scene_of_frame(recipe, frame_index)
     scene_recipe = recipe_of_scene(recipe, scene_id)
     environment = environment_of_scene(seed, scene_id, scene_recipe.environment)
@@ -198,7 +198,7 @@ def _hose_look(scene_recipe: Recipe, scene_id: int, pose: RigidTransform | None)
     """Paint of the hose, or None without a drogue or in a recipe without `[hose]`."""
     if scene_recipe.hose is None or pose is None:
         return None
-    return hose_look_of_scene(scene_recipe.seed, scene_id, scene_recipe.hose)
+    return hose_look_of_scene(scene_recipe.stream_seed, scene_id, scene_recipe.hose)
 
 
 def _frame_kinematics(
@@ -207,7 +207,7 @@ def _frame_kinematics(
     """Poses and motion of one frame."""
     if scene_recipe.sequence is not None:
         return sequence_kinematics(scene_recipe, scene_recipe.sequence, drogue, frame_index)
-    seed = scene_recipe.seed
+    seed = scene_recipe.stream_seed
     rotation = sample_attitude(frame_generator(seed, frame_index, "receiver"), scene_recipe.pose)
     world_from_left = RigidTransform(rotation, np.zeros(3))
     left_from_drogue = _pose_of_frame(scene_recipe, drogue, frame_index)
@@ -239,13 +239,16 @@ def _frame_kinematics(
 
 def _pose_of_frame(scene_recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
     """`left_from_drogue`, or None without a drogue."""
-    if frame_generator(scene_recipe.seed, frame_index, "empty").random() < scene_recipe.frames.empty_fraction:
+    if frame_generator(scene_recipe.stream_seed, frame_index, "empty").random() < scene_recipe.frames.empty_fraction:
         return None
     distance_m = sample_distance_m(
-        frame_generator(scene_recipe.seed, frame_index, "distance"), scene_recipe.distance, frame_index
+        frame_generator(scene_recipe.stream_seed, frame_index, "distance"), scene_recipe.distance, frame_index
     )
     return sample_pose(
-        frame_generator(scene_recipe.seed, frame_index, "pose"), scene_recipe, outline_points_m(drogue), distance_m
+        frame_generator(scene_recipe.stream_seed, frame_index, "pose"),
+        scene_recipe,
+        outline_points_m(drogue),
+        distance_m,
     )
 
 
@@ -254,10 +257,10 @@ def _placed_board(scene_recipe: Recipe, frame_index: int) -> PlacedBoard | None:
     if scene_recipe.board is None:
         return None
     distance_m = sample_distance_m(
-        frame_generator(scene_recipe.seed, frame_index, "distance"), scene_recipe.distance, frame_index
+        frame_generator(scene_recipe.stream_seed, frame_index, "distance"), scene_recipe.distance, frame_index
     )
     pose = sample_pose(
-        frame_generator(scene_recipe.seed, frame_index, "pose"),
+        frame_generator(scene_recipe.stream_seed, frame_index, "pose"),
         scene_recipe,
         scene_recipe.board.outline_m(),
         distance_m,
@@ -272,7 +275,7 @@ def _rangefinder_reading_m(
     if scene_recipe.rangefinder is None or left_from_drogue is None:
         return None
     return sample_rangefinder_m(
-        scene_recipe.rangefinder, scene_recipe.seed, frame_index, float(left_from_drogue.translation_m[2])
+        scene_recipe.rangefinder, scene_recipe.stream_seed, frame_index, float(left_from_drogue.translation_m[2])
     )
 
 

@@ -25,7 +25,7 @@ def tanker_of_scene(recipe: Recipe, scene_id: int) -> Tanker | None:
     ranges = recipe.tanker
     if ranges is None:
         return None
-    rng = frame_generator(recipe.seed, scene_id, "tanker")
+    rng = frame_generator(recipe.stream_seed, scene_id, "tanker")
     variant_place, station_place, paint_place, light_place, nav_place = rng.random(5)
     variant = ranges.variants[_chosen([variant.weight for variant in ranges.variants], variant_place)]
     paints = ranges.paints_of(variant)

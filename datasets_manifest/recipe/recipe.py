@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.random_streams import stream_seed
 from datasets_manifest.recipe.aircraft_ranges import HoseRanges, NeighbourRanges, ReceiverRanges, TankerRanges
 from datasets_manifest.recipe.camera_ranges import CameraRanges
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
@@ -56,6 +57,8 @@ class FrameCounts(FrozenModel):
     """Numbers of pairs and scenes, and the share of pairs without a drogue.
 
     Attributes:
+        stream: what keys the random streams beside the seed: recipes with two of them draw independently. In TOML the
+            recipe's name by default; empty for the seed alone, as in datasets from before there was this key.
         in_turn: whether scenes go through families and drogue variants in the given order, so that a few sequences have
             every combination: the family changes from scene to scene, the variant after a round of families. Otherwise
             they are drawn at random.
@@ -64,6 +67,7 @@ class FrameCounts(FrozenModel):
     count: int = Field(ge=1, le=10_000_000)
     scenes: int = Field(default=1, ge=1, le=1_000_000)
     empty_fraction: Fraction = 0.0
+    stream: str = Field(default="", max_length=80, exclude_if=lambda stream: not stream)
     # Left out at its default, so that the hashes of other recipes stay those of earlier versions.
     in_turn: bool = Field(default=False, exclude_if=lambda in_turn: not in_turn)
 
@@ -148,7 +152,7 @@ class Recipe(FrozenModel):
     Attributes:
         name: of the dataset.
         family: name of the conditions, for tables, in recipes without `families`.
-        seed: of all random streams.
+        seed: of all random streams, together with `frames.stream`.
         drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).
         board: a calibration board that every frame shows instead of a drogue, or none; `distance` and `pose` then apply
             to its centre.
@@ -187,6 +191,11 @@ class Recipe(FrozenModel):
     receiver: ReceiverRanges | None = Field(default=None, exclude_if=lambda receiver: receiver is None)
     neighbours: NeighbourRanges | None = Field(default=None, exclude_if=lambda neighbours: neighbours is None)
     camera: CameraRanges | None = Field(default=None, exclude_if=lambda camera: camera is None)
+
+    @property
+    def stream_seed(self) -> int:
+        """Seed of all random streams of scenes and frames."""
+        return stream_seed(self.seed, self.frames.stream) if self.frames.stream else self.seed
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
@@ -404,6 +413,7 @@ def parse_recipe(
     if not isinstance(drogue, str):
         raise ValueError("drogue: must be the name of a preset or a .toml file")
     table["drogue"] = load_drogue(drogue, base)
+    _fill_stream(table)
     fill_families(table)
     fill_distance(table)
     for part in (table, *table.get("families", ())):
@@ -430,6 +440,12 @@ def _with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str
         else:
             changed[key] = value
     return changed
+
+
+def _fill_stream(table: dict[str, Any]) -> None:
+    """Key a recipe's random streams, in place, by its name where it names no others."""
+    if isinstance(table.get("frames"), dict) and isinstance(table.get("name"), str):
+        table["frames"] = {"stream": table["name"], **table["frames"]}
 
 
 def _load_variants(target: object, base: Path | None) -> None:

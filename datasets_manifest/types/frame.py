@@ -124,7 +124,7 @@ class FrameSpec(FrozenModel):
     """Specification of one stereo pair. All of it is truth, which navigation never sees.
 
     Attributes:
-        seed: of the dataset; with `frame_index` it keys every random stream.
+        seed: with `frame_index` it keys every random stream; the recipe's `stream_seed`.
         frame_index: index in the dataset.
         family: the recipe's name for these conditions, for tables.
         scene_id: which drawn environment; splits are by scene.

@@ -69,7 +69,7 @@ def sequence_kinematics(
             turbulence.
     """
     sequence_id, place = divmod(frame_index, sequence.frames_per_sequence)
-    flight = _flight(recipe.seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
+    flight = _flight(recipe.stream_seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
     return flight.kinematics(place, recipe.rig.camera)
 
 

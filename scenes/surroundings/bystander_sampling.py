@@ -38,11 +38,11 @@ def bystanders_of_frame(
     """
     # Other objects stay the same throughout a sequence.
     key = frame_index if kinematics.sequence_id is None else kinematics.sequence_id
-    rng = frame_generator(recipe.seed, key, "bystanders")
+    rng = frame_generator(recipe.stream_seed, key, "bystanders")
     objects: list[Obstacle] = [_probe(recipe)] if recipe.target.probe else []
     if recipe.receiver is not None:
         keeps_tip = recipe.sequence is not None
-        objects += receiver_of_scene(recipe.seed, scene_id, recipe.receiver, recipe.rig, keeps_tip)
+        objects += receiver_of_scene(recipe.stream_seed, scene_id, recipe.receiver, recipe.rig, keeps_tip)
     objects += sample_obstacles(rng, recipe, kinematics, tanker)
     return tuple(objects) if kinematics.obstacle is None else (*objects, kinematics.obstacle)
 

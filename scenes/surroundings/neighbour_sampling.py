@@ -70,11 +70,11 @@ def neighbours_of_frame(
     # A multirotor flies alone.
     if kind.tanker is not None and kind.tanker.type == "multirotor":
         return ()
-    if frame_generator(recipe.seed, scene_id, "neighbours").random() >= ranges.scene_fraction:
+    if frame_generator(recipe.stream_seed, scene_id, "neighbours").random() >= ranges.scene_fraction:
         return ()
     hoses = recipe.hose or HoseRanges()
-    hose = hose_of_scene(recipe.seed, _SECOND_HOSE + scene_id, hoses, drogue)
-    rng = frame_generator(recipe.seed, frame_index, "neighbour")
+    hose = hose_of_scene(recipe.stream_seed, _SECOND_HOSE + scene_id, hoses, drogue)
+    rng = frame_generator(recipe.stream_seed, frame_index, "neighbour")
     first = _Formation(recipe, kinematics.left_from_drogue, kinematics.left_from_tanker, kind)
     # Only under the plain wing is there room for another pod.
     is_same = rng.random() < ranges.same_tanker_fraction and kind.tanker is None
@@ -91,7 +91,7 @@ def neighbours_of_frame(
         condition=kind.condition,
         left_from_drogue=left_from_exit @ tanker_from_drogue,
         hose_nodes_left_m=left_from_exit.apply(nodes_m),
-        hose_look=None if recipe.hose is None else hose_look_of_scene(recipe.seed, scene_id, recipe.hose),
+        hose_look=None if recipe.hose is None else hose_look_of_scene(recipe.stream_seed, scene_id, recipe.hose),
         left_from_tanker=second_tanker,
     )
     return (other,)

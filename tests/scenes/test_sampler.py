@@ -6,9 +6,9 @@ from typing import Any, Unpack
 import numpy as np
 import pytest
 
-from datasets_manifest.random_streams import bulk_frame_generator, frame_generator
+from datasets_manifest.random_streams import bulk_frame_generator, frame_generator, stream_seed
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
@@ -33,6 +33,57 @@ def test_frames_depend_on_seed_and_index_alone() -> None:
     again = [sample_frame(recipe(), index).model_dump_json() for index in (7, 3, 0)]
     assert first == [again[1], again[2], again[0]]
     assert sample_frame(recipe(seed=2), 3).model_dump_json() != first[0]
+
+
+def positions(drawn: Recipe) -> np.ndarray:
+    return np.array([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(400)]).ravel()
+
+
+def test_recipes_of_other_names_draw_other_scenes_and_poses() -> None:
+    same_place = stations(10.0)
+    names = {name: build_recipe(BASE, frames={"stream": name}, distance=same_place) for name in ("cloud", "low-light")}
+    one, other = (positions(drawn) for drawn in names.values())
+    # Four standard errors of a correlation of independent draws.
+    assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(800)
+    assert len({sample_frame(drawn, 0).seed for drawn in names.values()}) == 2
+    assert len({tuple(sorted(split_of_scenes(drawn).items())) for drawn in names.values()}) == 2
+
+
+def test_shipped_recipes_of_one_seed_do_not_share_poses() -> None:
+    one, other = (load_recipe(name).recipe for name in ("cloud", "low-light"))
+    assert one.seed == other.seed and one.frames.stream == "cloud"
+    poses = [sample_left_from_drogue(drawn, 0).translation_m[:2].tolist() for drawn in (one, other)]
+    assert poses[0] != poses[1]
+
+
+def test_a_recipe_of_another_name_may_keep_the_streams_of_the_first() -> None:
+    text = 'name = "{}"\ndistance = {{ law = "stations", stations_m = [10] }}\n[frames]\ncount = 400{}\n'
+    first, named, renamed = (
+        parse_recipe(text.format(*parts)) for parts in (("first", ""), ("second", '\nstream = "first"'), ("second", ""))
+    )
+    one, same, other = (sample_frame(drawn, 3).model_dump_json() for drawn in (first, named, renamed))
+    assert one == same != other
+    # As Python's interface renames them.
+    assert parse_recipe(text.format("first", ""), changes={"name": "second"}).frames.stream == "second"
+    assert parse_recipe(text.format("first", ""), changes={"frames": {"count": 9}}).frames.stream == "first"
+
+
+def test_streams_of_datasets_from_before_stay_as_they_were() -> None:
+    """Their recipes name no stream: the seed alone keys them, and the key is not written."""
+    drawn = build_recipe(BASE)
+    assert "stream" not in drawn.model_dump(mode="json")["frames"]
+    assert Recipe.model_validate_json(drawn.model_dump_json()).stream_seed == drawn.seed
+    named = build_recipe(BASE, frames={"stream": "cloud"})
+    assert Recipe.model_validate_json(named.model_dump_json()).stream_seed == named.stream_seed != named.seed
+
+
+def test_stream_seeds_differ_by_seed_and_name() -> None:
+    seeds = {stream_seed(seed, name) for seed in (0, 1, 2**63 - 1) for name in ("a", "b", "1 a", "")}
+    assert len(seeds) == 12
+    assert all(0 <= seed < 2**53 for seed in seeds)
+    assert stream_seed(1, "cloud") == 3_758_288_172_986_834
+    with pytest.raises(ValueError, match="must not be negative"):
+        stream_seed(-1, "a")
 
 
 def test_seed_zero_is_a_seed() -> None:

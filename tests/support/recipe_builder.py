@@ -73,8 +73,13 @@ def change_recipe(base: RecipeTable, /, **changes: Unpack[RecipeTable]) -> Recip
 
 
 def recipe_text(base: RecipeTable | None = None, /, **changes: Unpack[RecipeTable]) -> str:
-    """TOML of a recipe and its changes, see `change_recipe`."""
+    """TOML of a recipe and its changes, see `change_recipe`.
+
+    Its streams are keyed by the seed alone, so that a test's draws do not depend on the name that it gives.
+    """
     table = _merged(base or {}, changes)
+    if isinstance(table.get("frames"), Mapping):
+        table["frames"] = {"stream": "", **table["frames"]}
     sections = {key: value for key, value in table.items() if isinstance(value, Mapping)}
     lines = [f"{key} = {_value(value)}" for key, value in table.items() if key not in sections]
     for key, section in sections.items():
@@ -83,7 +88,7 @@ def recipe_text(base: RecipeTable | None = None, /, **changes: Unpack[RecipeTabl
 
 
 def build_recipe(base: RecipeTable | None = None, /, **changes: Unpack[RecipeTable]) -> Recipe:
-    """A recipe and its changes, parsed as a user's TOML is.
+    """A recipe and its changes, see `recipe_text`, parsed as a user's TOML is.
 
     Raises:
         ValueError: keys or values are wrong; names each key.
