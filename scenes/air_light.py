@@ -202,6 +202,11 @@ class LayeredAir:
         result: Radiance = air + clear * (light - air)
         return result
 
+    @property
+    def _upwelling_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance, from below, of the mist's underside by ground and air; level air has none. [lux]"""
+        return np.zeros(3)
+
     def mist_light(self, directions: NDArray[np.floating[Any]]) -> Radiance:
         """(..., 3) radiance of infinitely deep mist along (..., 3) unit directions. [cd/m2]"""
         mist = self._environment.mist
@@ -209,6 +214,9 @@ class LayeredAir:
         above = tuple(layer for layer in self._environment.clouds if layer.is_above)
         depth = BACK_SCATTER * mist.extinction_per_m * mist.above_m
         even = _AIR_IN_MIST / np.pi * transmitted_share(above) * self._open_level_lux / (1.0 + depth)
+        even = even + _AIR_IN_MIST / np.pi * self._upwelling_lux / (
+            1.0 + BACK_SCATTER * mist.extinction_per_m * mist.below_m
+        )
         cosine = np.einsum("...i,i->...", directions, self._sky.beam.direction)
         peak = henyey_greenstein(cosine, _DROPLET_ASYMMETRY)[..., None] * self.beam_illuminance_lux
         result: Radiance = (even + peak).astype(np.float32)

@@ -126,9 +126,9 @@ MOLECULES_AT_GROUND_PER_M = float(_AIR_KG_M3[0]) / _AIR_COLUMN_KG_M2
 _OZONE_CENTER_M, _OZONE_HALF_WIDTH_M = 25_000.0, 15_000.0
 AEROSOL_ASYMMETRY, AEROSOL_ALBEDO = 0.76, 0.94
 """Asymmetry of the scattering and single-scattering albedo of continental aerosol (Hess et al. 1998, OPAC, 550 nm)."""
-REPEATED_ASYMMETRY = 0.55
-"""Asymmetry for light that was scattered before and of which two moments are known: with it, the sky differs least from
-that of Monte Carlo paths."""
+REPEATED_FIRST, REPEATED_SECOND = 0.66, 0.33
+"""Legendre coefficients for light that was scattered before, of which only moments up to the second are known: those of
+the phase function, 0.76 and 0.76^2, damped so that the sky differs least from that of Monte Carlo paths."""
 _COLUMN_HEIGHTS, _COLUMN_ANGLES, _COLUMN_STEPS = 48, 160, 48
 
 

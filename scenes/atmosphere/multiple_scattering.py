@@ -1,8 +1,8 @@
 """Light that air and ground have scattered before, at any height and height of the sun: orders of scattering in turn.
 
-Light of one order is followed along rays from each node of a grid. Of its distribution over directions the mean and the
-net flux are kept, which is all that Rayleigh's phase function nearly needs, and of an aerosol's its asymmetry. The grid
-covers all heights of the sun, so that one table serves sun and moon at any time.
+Light of one order is followed along rays from each node of a grid. Of its distribution over directions the moments up
+to the second are kept: all that Rayleigh's phase function needs, and with them an aerosol's forward side meets the
+bright ring of the horizon. The grid covers all heights of the sun, so that one table serves sun and moon at any time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from scipy.sparse import csr_matrix
 
 from scenes.atmosphere.air_layers import (
     EARTH_M,
-    REPEATED_ASYMMETRY,
+    REPEATED_FIRST,
+    REPEATED_SECOND,
     AirLayers,
     Array,
     aerosol_phase,
@@ -62,8 +63,8 @@ _SUN_DEG = np.array(
     ],
     dtype=np.float64,
 )
-_UP, _DOWN, _AROUND, _STEPS, _ORDERS = 8, 4, 6, 16, 6
-# The first two moments of strongly one-sided light leave too little of the other side: so much of the mean stays.
+_UP, _DOWN, _AROUND, _STEPS, _ORDERS, _MOMENTS = 8, 4, 6, 16, 6, 6
+# Few moments of strongly one-sided light leave too little of the other side: so much of the mean stays.
 _LEAST_SHARE = 0.05
 
 
@@ -72,8 +73,8 @@ class ScatteredLight:
     """Moments of the light that was scattered once or more, over the sun's irradiance outside the atmosphere.
 
     Attributes:
-        moments: (H S, 3, L) mean over the sphere of radiance and of radiance times the direction it comes from, upwards
-            and level towards the sun. [1/sr]
+        moments: (H S, 6, L) mean over the sphere of radiance, and of radiance times the components of the direction it
+            comes from: upwards, level towards the sun, and their products up up, up level, level level. [1/sr]
         ground: (S, L) illuminance of level ground by scattered light.
     """
 
@@ -81,9 +82,9 @@ class ScatteredLight:
     ground: Array
 
     def at(self, height_m: Array, sun_sine: Array) -> Array:
-        """(N, 3, L) moments at (N,) heights and sines of the sun's elevation."""
+        """(N, 6, L) moments at (N,) heights and sines of the sun's elevation."""
         moved: Array = grid_weights(height_m, sun_sine) @ self.moments.reshape(self.moments.shape[0], -1)
-        return moved.reshape(len(height_m), 3, -1)
+        return moved.reshape(len(height_m), _MOMENTS, -1)
 
     def ground_at(self, sun_sine: float) -> Array:
         """(L,) illuminance of level ground under a sun of that sine of elevation."""
@@ -131,17 +132,21 @@ def source(moments: Array, scattered: tuple[Array, Array], up: Array, level: Arr
     """(N, L) light that reaches the start of rays from a step of theirs, of light that was scattered before.
 
     Args:
-        moments: (N, 3, L) of that light, as in `ScatteredLight`.
+        moments: (N, 6, L) of that light, as in `ScatteredLight`.
         scattered: (N, L) share of it that molecules and aerosol scatter into the ray, times 4 pi over their phase
             functions.
         up, level: (N,) components of the rays' directions there, along the vertical, and level towards the sun.
     """
-    mean = moments[:, 0]
-    sided = moments[:, 1] * up[:, None] + moments[:, 2] * level[:, None]
+    mean, of_up, of_level, up_up, up_level, level_level = np.moveaxis(moments, 1, 0)
+    up, level = up[:, None], level[:, None]
+    # By Legendre polynomials of the angle between where light comes from and where the ray looks.
+    first = of_up * up + of_level * level
+    aside = 1.0 - up * up - level * level
+    square = up_up * (up * up - aside) + level_level * (level * level - aside) + 2.0 * up_level * (up * level)
+    second = 1.5 * (square + aside * mean) - 0.5 * mean
     molecules, aerosol = scattered
-    result: Array = molecules * mean + aerosol * np.maximum(
-        mean + 3.0 * REPEATED_ASYMMETRY * sided, _LEAST_SHARE * mean
-    )
+    of_aerosol = mean + 3.0 * REPEATED_FIRST * first + 5.0 * REPEATED_SECOND * second
+    result: Array = molecules * (mean + 0.5 * second) + aerosol * np.maximum(of_aerosol, _LEAST_SHARE * mean)
     return result
 
 
@@ -195,14 +200,16 @@ def scattered_light(layers: AirLayers) -> ScatteredLight:
     direct = np.maximum(at_nodes, 0.0)[:, None] * layers.sunlight(np.zeros(suns), at_nodes)
     light += reflects * (on_ground @ direct)
 
+    up, level = ray_sine.reshape(shape), level.reshape(shape)
+    components = np.stack([np.ones(shape), up, level, up * up, up * level, level * level])
+
     def moments_of(light: Array) -> tuple[Array, Array]:
         shaped = light.reshape(*shape, -1)
         weighted = shaped * (share / (4.0 * np.pi))[..., None]
-        along = ray_sine.reshape(shape)[..., None], level.reshape(shape)[..., None]
-        moments = np.stack([weighted.sum(axis=(2, 3)), *((weighted * axis).sum(axis=(2, 3)) for axis in along)], axis=2)
-        rises = np.maximum(along[0][0], 0.0)
+        moments = np.einsum("hsdal,mhsda->hsml", weighted, components)
+        rises = np.maximum(components[1, 0][..., None], 0.0)
         ground = (4.0 * np.pi * weighted[0] * rises).sum(axis=(1, 2))
-        return moments.reshape(heights * suns, 3, -1), ground
+        return moments.reshape(heights * suns, _MOMENTS, -1), ground
 
     moments, ground = moments_of(light)
     total, total_ground, last = moments.copy(), ground.copy(), moments
@@ -210,7 +217,7 @@ def scattered_light(layers: AirLayers) -> ScatteredLight:
         light = reflects * (on_ground @ ground)
         flat = moments.reshape(moments.shape[0], -1)
         for step in steps:
-            there = (step.weights @ flat).reshape(len(height_m), 3, -1)
+            there = (step.weights @ flat).reshape(len(height_m), _MOMENTS, -1)
             light += source(there, step.scattered, step.up, step.level)
         last = moments
         moments, ground = moments_of(light)

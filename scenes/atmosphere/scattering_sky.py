@@ -198,6 +198,20 @@ class ScatteringAir(LayeredAir):
     def _beam_on_ground_lux(self) -> Array:
         return self._sky.beam.beam_illuminance_lux(0.0)
 
+    @cached_property
+    def _upwelling_lux(self) -> Array:
+        """(3,) illuminance of the mist's underside by ground, clouds below and the air in front of them. [lux]"""
+        directions, weight = hemisphere(15)
+        falling = directions * np.array([1.0, 1.0, -1.0])
+        above = tuple(layer for layer in self._environment.clouds if layer.is_above)
+        below = np.array(self._scattering.layers.ground_rgb) / np.pi * transmitted_share(above) * self._ground_open_lux
+        mist = self._environment.mist
+        assert mist is not None
+        below = below / (1.0 + BACK_SCATTER * mist.extinction_per_m * (mist.above_m + mist.below_m))
+        light = self.sky_and_air(falling)[1] + self._clear_to_ground(falling) * below
+        result: Array = np.einsum("ijc,ij->c", light, weight)
+        return result
+
     def sky_and_air(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
         """Sky behind the air, and light of the air in front of the ground, without mist.
 

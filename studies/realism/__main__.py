@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import GROUND_KINDS, Environment, SkyModel
+from scenes.atmosphere.air_layers import horizon_dip_rad
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
 from studies.realism.cloud_measures import cloud_table
@@ -19,7 +20,7 @@ from studies.realism.ground_measures import ground_table
 
 SKY_MODELS: tuple[SkyModel, ...] = ("daylight", "scattering")
 # The visibilities at which both have a common clear day: around the camera, and at the ground.
-_VISIBILITY_M: dict[SkyModel, float] = {"daylight": 120_000.0, "scattering": 50_000.0}
+_VISIBILITY_M: dict[SkyModel, float] = {"daylight": 120_000.0, "scattering": 70_000.0}
 _DISC_STEP_DEG = 0.05
 
 
@@ -38,7 +39,7 @@ class SkyMeasure:
     measure: Callable[[SkyModel], float]
 
 
-def _around(model: SkyModel, sun_deg: float, altitude_m: float, turbidity: float = 3.0) -> EnvironmentRadiance:
+def _around(model: SkyModel, sun_deg: float, altitude_m: float, turbidity: float = 2.5) -> EnvironmentRadiance:
     environment = Environment(
         sun_elevation_deg=sun_deg,
         sun_azimuth_deg=0.0,
@@ -63,13 +64,13 @@ _AWAY = (60.0, 90.0, 120.0, 150.0, 180.0)
 
 def glow_blue_over_red(model: SkyModel) -> float:
     """Blue over red 1 degree up, from 3 km, over a sun 4 degrees down."""
-    light = _sky(_around(model, -4.0, 3000.0, 2.5), 1.0, (0.0,))
+    light = _sky(_around(model, -4.0, 3000.0), 1.0, (0.0,))
     return float(light[2] / light[0])
 
 
 def glow_8_over_horizon(model: SkyModel, altitude_m: float = 3000.0) -> float:
     """Luminance 8 degrees up over that 1 degree up, over a sun 4 degrees down."""
-    around = _around(model, -4.0, altitude_m, 2.5)
+    around = _around(model, -4.0, altitude_m)
     return float(luminance(_sky(around, 8.0, (0.0,))) / luminance(_sky(around, 1.0, (0.0,))))
 
 
@@ -82,6 +83,13 @@ def whitening(model: SkyModel) -> float:
 def day_blue_over_red(model: SkyModel) -> float:
     """Blue over red 3 degrees up by day, away from the sun."""
     light = _sky(_around(model, 40.0, 10.0), 3.0, _AWAY)
+    return float(light[2] / light[0])
+
+
+def high_blue_over_red(model: SkyModel) -> float:
+    """Blue over red 3 degrees above the horizon that is seen from 3 km, by day, away from the sun."""
+    dip_deg = float(np.degrees(horizon_dip_rad(3000.0))) if model == "scattering" else 0.0
+    light = _sky(_around(model, 40.0, 3000.0), 3.0 - dip_deg, _AWAY)
     return float(light[2] / light[0])
 
 
@@ -101,7 +109,7 @@ def setting_deg(model: SkyModel) -> float:
 
 def illuminance_lux(model: SkyModel, sun_deg: float) -> float:
     """Illuminance of level ground under the clear sky. [lux]"""
-    return float(luminance(_around(model, sun_deg, 10.0, 2.5).ground_illuminance_lux))
+    return float(luminance(_around(model, sun_deg, 10.0).ground_illuminance_lux))
 
 
 SKY_MEASURES: tuple[SkyMeasure, ...] = (
@@ -114,6 +122,7 @@ SKY_MEASURES: tuple[SkyMeasure, ...] = (
     ),
     SkyMeasure("Y(20 deg) / Y(0) by day", "0.61 (CIE clear), 0.49 (an HDRI)", whitening),
     SkyMeasure("B/R 3 deg up by day", "1.25 to 1.4", day_blue_over_red),
+    SkyMeasure("B/R 3 deg over the horizon seen from 3 km", "bluer than from the ground", high_blue_over_red),
     SkyMeasure("sun sets from 3 km at [deg]", "-1.76 - 0.27 (dip, radius)", setting_deg),
     SkyMeasure("illuminance at -0.833 deg [lux]", "410 to 585", lambda model: illuminance_lux(model, -0.833)),
     SkyMeasure("illuminance at -6 deg [lux]", "2.0 to 3.5", lambda model: illuminance_lux(model, -6.0)),
