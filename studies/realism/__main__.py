@@ -1,4 +1,4 @@
-"""Prints how far modelled skies, clouds and grounds are from real ones: `python -m studies.realism sky`."""
+"""Prints how far modelled skies, clouds and grounds are from real ones, and how many scenes look different."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.environment import GROUND_KINDS, Environment, SkyModel
 from scenes.atmosphere.air_layers import horizon_dip_rad
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
 from studies.realism.cloud_measures import cloud_table
 from studies.realism.ground_measures import ground_table
+from studies.realism.scene_variety import variety_table
 
 SKY_MODELS: tuple[SkyModel, ...] = ("daylight", "scattering")
 # The visibilities at which both have a common clear day: around the camera, and at the ground.
@@ -162,11 +164,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clouds.add_argument("--photographs", nargs="*", type=Path, default=[], help="pictures of clouds to measure too")
     ground = parts.add_parser("ground", help="share of the ground's pictures that is noise")
     ground.add_argument("--kinds", nargs="+", choices=GROUND_KINDS, default=GROUND_KINDS, help="of ground")
+    variety = parts.add_parser("variety", help="how many scenes of recipes look different")
+    variety.add_argument("recipes", nargs="+", metavar="RECIPE", help="name of a recipe, or a .toml file")
+    variety.add_argument("--family", nargs="+", metavar="NAME", default=(), help="of these families alone")
     given = parser.parse_args(arguments)
     if given.part == "sky":
         print(sky_table())
     elif given.part == "clouds":
         print(cloud_table(given.photographs))
+    elif given.part == "variety":
+        for name in given.recipes:
+            print(variety_table(load_recipe(name).recipe, given.family), flush=True)
     else:
         print(ground_table(tuple(given.kinds)))
 
