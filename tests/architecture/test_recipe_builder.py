@@ -22,7 +22,7 @@ BASE: RecipeTable = {
     "description": 'quotes " and \\ and é',
     "seed": 0,
     "rig": RIG_160_PX,
-    "frames": {"count": 4, "in_turn": True},
+    "frames": {"count": 4, "in_turn": True, "stream": ""},
     "distance": stations(2.0, 5),
     "exposure": {"time_s": 1e-6},
     "families": [{"name": "a"}, {"name": "b", "environment": {"sun_elevation_deg": [20, 60.5]}}],
@@ -41,7 +41,7 @@ def test_changes_reach_into_sections_and_leave_the_base_alone() -> None:
     before = recipe_text(BASE)
     changed = change_recipe(BASE, seed=7, frames={"scenes": 2, "in_turn": None}, families=None)
     assert changed["seed"] == 7 and "families" not in changed
-    assert changed["frames"] == {"count": 4, "scenes": 2}
+    assert changed["frames"] == {"count": 4, "scenes": 2, "stream": ""}
     assert changed["distance"] is BASE["distance"]
     assert recipe_text(BASE) == before
 
