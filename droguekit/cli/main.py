@@ -42,6 +42,9 @@ COMMANDS = {
     "merge": Command("droguekit.cli.dataset_commands", "Join shards of a dataset into one."),
     "import": Command("droguekit.cli.exchange_commands", "Make a dataset from real stereo images, without truth."),
     "validate": Command("droguekit.cli.dataset_commands", "Check a dataset: files, hashes, labels against part ids."),
+    "coverage": Command(
+        "droguekit.cli.assurance_commands", "Count a dataset's pairs in the cells of an operational design domain."
+    ),
     "reproduce": Command("droguekit.cli.dataset_commands", "Render one frame of a dataset again and compare."),
     "export": Command("droguekit.cli.exchange_commands", "Write a dataset's labels in another format."),
     "preview": Command("droguekit.cli.viewing_commands", "Draw a contact sheet of a dataset with its labels."),

@@ -1,0 +1,1 @@
+"""What a dataset covers, and how two datasets differ."""

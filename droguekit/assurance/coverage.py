@@ -1,0 +1,275 @@
+"""What a dataset covers of an operational design domain: pairs in each cell, and how well they are solved there."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
+from datasets_manifest.types.records import PairRecord
+from drogue_models.frozen_model import FrozenModel
+from droguekit.assurance.design_domain import Crossing, DesignDomain, Placed
+from droguekit.batch.progress import PlainProgress, ProgressReport
+from droguekit.scoring.confidence_intervals import Interval, fraction_interval
+from droguekit.scoring.detection.detection_metrics import Evaluation, best_f1
+from droguekit.scoring.detection.detection_truth import ImageTruth, image_truth
+from droguekit.scoring.poses.pose_errors import estimates_by_method
+from droguekit.scoring.results.detection_result import image_id_of, read_detections
+from geometry.stereo import EYES
+
+_MOST_LINES = 20
+
+
+class Share(FrozenModel):
+    """How many of the cases in a cell were solved.
+
+    Attributes:
+        hits, count: solved cases, and all: pairs for poses, images for boxes.
+        interval: 95 % confidence interval of the share, by Wilson's formula as if cases were independent.
+    """
+
+    hits: int
+    count: int
+    interval: Interval
+
+
+class Cell(FrozenModel):
+    """One combination of bins.
+
+    Attributes:
+        bins: one of each crossed quantity.
+        pairs: that lie in it.
+        scores: by the name of a method or of a file of detections; only where there are cases.
+    """
+
+    bins: tuple[str, ...]
+    pairs: int
+    scores: dict[str, Share] = Field(default_factory=dict)
+
+
+class CrossingCoverage(FrozenModel):
+    """The cells of one crossing.
+
+    Attributes:
+        of: its quantities.
+        fewest_pairs: that every cell needs.
+        outside: pairs that lie outside of the bins of one of them.
+        cells: all of them, the last quantity running fastest.
+    """
+
+    of: tuple[str, ...]
+    fewest_pairs: int
+    outside: int
+    cells: tuple[Cell, ...]
+
+    @property
+    def lacking(self) -> tuple[Cell, ...]:
+        """Cells with fewer pairs than they need."""
+        return tuple(cell for cell in self.cells if cell.pairs < self.fewest_pairs)
+
+
+class Coverage(FrozenModel):
+    """What a dataset covers of a domain.
+
+    Attributes:
+        dataset, dataset_sha256: which one.
+        domain: name of the domain.
+        pairs: of the dataset.
+        outside: pairs that lie outside of all bins of a quantity, by quantity; pairs for which it has no meaning, such
+            as a distance without a drogue, do not count.
+        scored: names in the cells' scores.
+        crossings: as in the domain.
+    """
+
+    dataset: str
+    dataset_sha256: str
+    domain: str
+    pairs: int
+    outside: dict[str, int]
+    scored: tuple[str, ...]
+    crossings: tuple[CrossingCoverage, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every cell has the pairs that it needs."""
+        return not any(crossing.lacking for crossing in self.crossings)
+
+
+@dataclass
+class _Tally:
+    """Pairs and solved cases by cell."""
+
+    pairs: Counter[tuple[str, ...]] = field(default_factory=Counter)
+    hits: dict[str, Counter[tuple[str, ...]]] = field(default_factory=lambda: defaultdict(Counter))
+    counts: dict[str, Counter[tuple[str, ...]]] = field(default_factory=lambda: defaultdict(Counter))
+    outside: int = 0
+
+
+def measure_coverage(
+    dataset: Location,
+    domain: DesignDomain,
+    estimates: Path | None = None,
+    detections: Sequence[Path] = (),
+    report: ProgressReport | None = None,
+) -> Coverage:
+    """Count the pairs in each cell of a domain, and the solved ones where there are estimates or detections.
+
+    A pose is solved where its position is wrong by at most the domain's fraction of the distance; a pair without an
+    estimate is not. A box is solved where the detector's box overlaps it by half, from the score on that gives the best
+    F1 on the whole dataset.
+
+    Args:
+        dataset: with its truth.
+        domain: whose cells are counted.
+        estimates: file of poses.
+        detections: files of COCO results.
+        report: is told of the progress, or None.
+
+    Raises:
+        ValueError: no such dataset, or a record or file that cannot be read.
+    """
+    source = Dataset(dataset)
+    read = None if estimates is None else read_estimates(estimates)
+    methods = {} if read is None else estimates_by_method(read, source.frame_indices, str(estimates))
+    camera, splits = source.manifest.recipe.rig.camera, source.manifest.split_of_frame()
+    placed: dict[int, dict[str, Placed]] = {}
+    solved: dict[int, dict[str, tuple[int, int]]] = defaultdict(dict)
+    images: list[ImageTruth] = []
+    shown = PlainProgress(io.StringIO()) if report is None else report
+    shown.begin("pairs", len(source.frame_indices))
+    try:
+        for index in source.frame_indices:
+            record = source.record(index)
+            placed[index] = domain.bins_of(record)
+            for name, answers in methods.items():
+                if record.left_from_drogue is not None:
+                    answer = answers.get(index)
+                    solved[index][name] = int(_is_near(answer, record, domain.most_position_error_fraction)), 1
+            if detections:
+                size_px = (camera.width_px, camera.height_px)
+                images += [image_truth(record, eye, splits[index], size_px) for eye in EYES]
+            shown.advance()
+    finally:
+        shown.end()
+    image_ids = frozenset(image_id_of(index, eye) for index in source.frame_indices for eye in EYES)
+    for path in detections:
+        if path.stem in methods:
+            raise ValueError(f"--detections: {path.stem!r} is also a method's name; rename the file")
+        for index, share in _found_boxes(images, path, image_ids).items():
+            solved[index][path.stem] = share
+    names = (*methods, *(path.stem for path in detections))
+    return Coverage(
+        dataset=source.manifest.name,
+        dataset_sha256=source.manifest.dataset_sha256,
+        domain=domain.name,
+        pairs=len(source.frame_indices),
+        outside={
+            name: sum(bins[name].applies and bins[name].bin is None for bins in placed.values())
+            for name in domain.quantities
+        },
+        scored=names,
+        crossings=tuple(_crossing(domain, crossing, placed, solved) for crossing in domain.cells),
+    )
+
+
+def _is_near(answer: Estimate | None, record: PairRecord, most_fraction: float) -> bool:
+    if not isinstance(answer, PoseEstimate) or record.left_from_drogue is None:
+        return False
+    truth_m = record.left_from_drogue.translation_m
+    error_m = float(np.linalg.norm(answer.left_from_drogue.translation_m - truth_m))
+    return error_m <= most_fraction * float(np.linalg.norm(truth_m))
+
+
+def _found_boxes(images: Sequence[ImageTruth], path: Path, image_ids: frozenset[int]) -> dict[int, tuple[int, int]]:
+    """By frame: in how many of its images the sought drogue is found, and in how many it is to be found."""
+    matches = Evaluation(images, read_detections(path, image_ids)).matches(images)
+    best = best_f1(matches)
+    is_found = matches.found_scores() >= (math.inf if best is None else best.threshold)
+    shares: dict[int, tuple[int, int]] = {}
+    for image, is_shown, found in zip(matches.images, matches.has_drogue, is_found, strict=True):
+        if is_shown:
+            hits, count = shares.get(image.frame_index, (0, 0))
+            shares[image.frame_index] = hits + int(found), count + 1
+    return shares
+
+
+def _crossing(
+    domain: DesignDomain,
+    crossing: Crossing,
+    placed: dict[int, dict[str, Placed]],
+    solved: dict[int, dict[str, tuple[int, int]]],
+) -> CrossingCoverage:
+    tally = _Tally()
+    for index, bins in placed.items():
+        own = [bins[name] for name in crossing.of]
+        if not all(place.applies for place in own):
+            continue
+        cell = tuple(place.bin for place in own if place.bin is not None)
+        if len(cell) < len(own):
+            tally.outside += 1
+            continue
+        tally.pairs[cell] += 1
+        for name, (hits, count) in solved[index].items():
+            tally.hits[name][cell] += hits
+            tally.counts[name][cell] += count
+    cells = []
+    for cell in domain.cells_of(crossing):
+        scores = {
+            name: Share(
+                hits=tally.hits[name][cell],
+                count=counts[cell],
+                interval=fraction_interval(tally.hits[name][cell], counts[cell]),
+            )
+            for name, counts in tally.counts.items()
+            if counts[cell]
+        }
+        cells.append(Cell(bins=cell, pairs=tally.pairs[cell], scores=scores))
+    return CrossingCoverage(
+        of=crossing.of, fewest_pairs=crossing.fewest_pairs, outside=tally.outside, cells=tuple(cells)
+    )
+
+
+def coverage_lines(coverage: Coverage) -> Iterator[str]:
+    """What a terminal shows: each crossing in a line, and the cells that lack pairs."""
+    yield f"{coverage.dataset}: {coverage.pairs} pairs against the domain {coverage.domain}"
+    for name, pairs in coverage.outside.items():
+        if pairs:
+            yield f"outside the domain's {name}: {pairs} pairs"
+    for crossing in coverage.crossings:
+        lacking = crossing.lacking
+        state = f"{len(lacking)} lack pairs" if lacking else "all have enough"
+        cells = f"{len(crossing.cells)} cells, each to have {crossing.fewest_pairs} pairs"
+        yield f"{' x '.join(crossing.of)}: {cells}: {state}"
+        for cell in lacking[:_MOST_LINES]:
+            yield f"  {cell_name(crossing, cell)}: {cell.pairs} pairs"
+        if len(lacking) > _MOST_LINES:
+            yield f"  and {len(lacking) - _MOST_LINES} more"
+        for name in coverage.scored:
+            worst = worst_cell(crossing, name)
+            if worst is not None:
+                share = worst.scores[name]
+                low, high = share.interval
+                yield (
+                    f"  {name} is worst at {cell_name(crossing, worst)}: {share.hits} of {share.count} solved, "
+                    f"{100 * low:.0f} to {100 * high:.0f} %"
+                )
+
+
+def cell_name(crossing: CrossingCoverage, cell: Cell) -> str:
+    """A cell in words."""
+    return ", ".join(f"{name} {bin_name}" for name, bin_name in zip(crossing.of, cell.bins, strict=True))
+
+
+def worst_cell(crossing: CrossingCoverage, name: str) -> Cell | None:
+    """The cell whose share is surely lowest: the one with the lowest upper end of the interval; None without cases."""
+    scored = [cell for cell in crossing.cells if name in cell.scores]
+    return min(scored, key=lambda cell: cell.scores[name].interval[1], default=None)

@@ -1,0 +1,61 @@
+"""Commands that tell what datasets cover: coverage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from droguekit.batch.progress import progress_report
+from droguekit.cli.arguments import DatasetArgument, output_option
+from droguekit.cli.main import FAULT
+
+EXAMPLES = {
+    "coverage": (
+        "droguekit coverage data/world --html coverage.html",
+        "droguekit coverage data/world --odd my-domain.toml --json coverage.json",
+        "droguekit coverage data/world --estimates estimates.jsonl --detections boxes.json --html coverage.html",
+    ),
+}
+
+
+def coverage(
+    dataset: DatasetArgument,
+    odd: Annotated[
+        str, typer.Option("--odd", metavar="NAME", help="Operational design domain: a shipped one, or a .toml file.")
+    ] = "probe-and-drogue",
+    estimates: Annotated[
+        Path | None, typer.Option("--estimates", metavar="FILE.jsonl", help="Poses to score in each cell.")
+    ] = None,
+    detections: Annotated[
+        list[Path] | None, typer.Option("--detections", metavar="FILE.json", help="Boxes to score in each cell.")
+    ] = None,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Write the numbers.")] = None,
+    html: Annotated[
+        Path | None, output_option("--html", "FILE", "Write one page with a table of each crossing.")
+    ] = None,
+) -> None:
+    """Count a dataset's pairs in the cells of an operational design domain, and show which cells have too few.
+
+    With estimates or detections, also how many of the pairs in each cell are solved.
+
+    Exits with 1 where a cell has fewer pairs than the domain asks for.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from droguekit.assurance.coverage import coverage_lines, measure_coverage
+    from droguekit.assurance.design_domain import load_domain
+    from droguekit.visualization.coverage_page import write_coverage_page
+
+    domain = load_domain(odd)
+    found = measure_coverage(dataset, domain, estimates, detections or (), progress_report())
+    for line in coverage_lines(found):
+        typer.echo(line)
+    if json_ is not None:
+        json_.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(json_, found.model_dump_json(indent=1) + "\n")
+    if html is not None:
+        write_coverage_page(found, domain, html)
+        typer.echo(f"wrote {html}")
+    if not found.is_complete:
+        raise typer.Exit(FAULT)
