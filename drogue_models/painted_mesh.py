@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from geometry.se3 import Array, read_only
 
@@ -17,6 +19,8 @@ LOWEST_REFLECTANCE, HIGHEST_REFLECTANCE = 0.01, 0.95
 """What painters of maps keep to: soot reflects 0.01 to 0.03 in the visible, fresh white paint up to 0.9."""
 
 
+# Bodies of at least this thickness are a pixel wide out to 100 m. [m]
+_NARROW_M = 0.06
 # A polygon with the area of a disc reaches so much beyond the square around the disc.
 _UV_TOLERANCE = 1e-3
 
@@ -91,6 +95,36 @@ class PaintedMesh:
         """Equal for meshes whose vertices can be moved into each other's places: the same faces of as many vertices."""
         faces = np.ascontiguousarray(self.mesh.faces, dtype=np.int64)
         return f"{len(self.mesh.vertices)} {hashlib.blake2b(faces.tobytes(), digest_size=16).hexdigest()}"
+
+    @cached_property
+    def narrow_edges(self) -> tuple[NDArray[np.int64], Array]:
+        """Edges of all bodies that are thin, such as struts, cords and blades.
+
+        Returns:
+            (E, 2) indices of vertices, and (E,) the thickness of their bodies: four times the volume over the surface,
+            which is the diameter of a long cylinder and twice the thickness of a plate. [m]
+        """
+        # Vertices are split at creases and seams.
+        _, place = np.unique(np.round(self.mesh.vertices, 6), axis=0, return_inverse=True)
+        faces, place = np.asarray(self.mesh.faces), place.ravel()
+        joined = place[faces]
+        links = coo_matrix((np.ones(2 * len(faces)), (joined[:, [0, 1]].ravel(), joined[:, [1, 2]].ravel())))
+        links.resize(place.max() + 1, place.max() + 1)
+        count, label = connected_components(links, directed=False)
+        body = label[joined[:, 0]]
+        corners = np.asarray(self.mesh.triangles)
+        number = np.maximum(np.bincount(body, minlength=count), 1)
+        middle = (
+            np.stack([np.bincount(body, axis, count) for axis in corners.mean(axis=1).T], axis=-1) / number[:, None]
+        )
+        corners = corners - middle[body, None]
+        across = np.cross(corners[:, 1], corners[:, 2])
+        volume_m3 = np.bincount(body, np.einsum("ij,ij->i", corners[:, 0], across) / 6, count)
+        thickness_m = 4 * np.abs(volume_m3) / np.maximum(np.bincount(body, self.mesh.area_faces, count), 1e-12)
+        edges = faces[thickness_m[body] < _NARROW_M][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        edges = np.sort(edges, axis=1)
+        _, first = np.unique(edges[:, 0] * len(self.mesh.vertices) + edges[:, 1], return_index=True)
+        return edges[first], thickness_m[label[place[edges[first, 0]]]]
 
     @cached_property
     def mean_reflectance(self) -> Array:

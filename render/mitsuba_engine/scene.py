@@ -50,6 +50,7 @@ class DrogueScene:
         emits: whether any surface may shine.
         glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
         shiny_parts: ids of parts with a sheen.
+        surfaces: all of the frame, in the stage's axes.
         map_bytes: size of all reflectance maps.
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
@@ -80,6 +81,7 @@ class DrogueScene:
         self.object_corners_m = [self._drogue_m, *(surface.hull_m() for surface in surfaces.moved.values())]
         self.lamp_corners_m = [surface.hull_m() for surface in surfaces.moved.values() if surface.is_lamp]
         self.uneven_parts = surfaces.uneven_parts
+        self.surfaces = list(surfaces.all.values())
         for name, surface in surfaces.moved.items():
             self._set_moved(name, surface)
         for name, surface in surfaces.all.items():

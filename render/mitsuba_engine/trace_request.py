@@ -137,7 +137,11 @@ class SamplingPlan:
 
 
 def plan_pixels(
-    ids: list[NDArray[np.uint8]], sunlit: list[NDArray[np.bool_]], margin_px: int, uneven: Iterable[int]
+    ids: list[NDArray[np.uint8]],
+    sunlit: list[NDArray[np.bool_]],
+    margin_px: int,
+    uneven: Iterable[int],
+    narrow: NDArray[np.uint8] | None = None,
 ) -> SamplingPlan:
     """Which pixels to trace.
 
@@ -146,6 +150,7 @@ def plan_pixels(
         sunlit: (H, W) whether the drogue's surface there sees the sun, at the same times.
         margin_px: how far a part may extend beyond those centres into other pixels.
         uneven: ids of parts whose paint has edges of its own anywhere.
+        narrow: (H, W) ids of parts that may pass between the pixel centres.
     """
     even = (parts_table(uneven) == 0).astype(np.uint8)
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
@@ -158,6 +163,9 @@ def plan_pixels(
         inside &= inside_one_part((2 * part_id.astype(np.uint16) + in_sun).astype(np.uint16), margin_px) & parts_in(
             part_id, even
         )
+    if narrow is not None:
+        drogue |= parts_in(narrow, DROGUE_PARTS)
+        covered |= narrow != Part.SKY
     belongs, reached = (cv2.dilate(seen.view(np.uint8), kernel) > 0 for seen in (drogue, covered))
     of_open, of_deep = (parts_in(ids[0], table) for table in (OPEN_TO_SKY, _DEEP))
     within, edges = belongs & inside, belongs & ~inside

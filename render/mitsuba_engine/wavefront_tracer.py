@@ -40,7 +40,10 @@ from render.mitsuba_engine.trace_request import (
     plan_pixels,
 )
 
+# Parts of a smaller width may pass between pixel centres over a longer way than the pixels around a centre reach. [px]
+_NARROW_PX = 1.2
 _OF_DROGUE = {int(part) for part in np.flatnonzero(DROGUE_PARTS)}
+_ANY_PART = parts_table(range(1, 256))
 
 
 class WavefrontTracer:
@@ -62,14 +65,16 @@ class WavefrontTracer:
         times = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
         eyes: dict[Eye, TracedEye] = {}
         plans: dict[Eye, SamplingPlan] = {}
+        narrow: dict[Eye, NDArray[np.uint8]] = {}
         for eye in EYES:
             passes = CenterPasses(frame, eye, scene)
             seen = [passes.part_ids(s) for s in times]
             sunlit = [passes.sunlit(ids, s) for (ids, _), s in zip(seen, times, strict=True)]
-            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), scene.uneven_parts)
+            narrow[eye], margin_px = passes.narrow_parts(), 1 + int(np.ceil(moves_px))
+            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, margin_px, scene.uneven_parts, narrow[eye])
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        result = _by_eye(_sample_light(request, scene, eyes, plans), eyes, stage_s)
+        result = _by_eye(_sample_light(request, scene, eyes, (plans, narrow)), eyes, stage_s)
         stage_s["paths"] = time.process_time() - started
         return result
 
@@ -89,10 +94,21 @@ def _by_eye(sampled: SampledLight, eyes: dict[Eye, TracedEye], stage_s: dict[str
 
 
 def _sample_light(
-    request: TraceRequest, scene: DrogueScene, eyes: dict[Eye, TracedEye], plans: dict[Eye, SamplingPlan]
+    request: TraceRequest,
+    scene: DrogueScene,
+    eyes: dict[Eye, TracedEye],
+    planned: tuple[dict[Eye, SamplingPlan], dict[Eye, NDArray[np.uint8]]],
 ) -> SampledLight:
-    """Sampled light of all planned pixels; denoised where the settings ask for it and all of the drogue is matt."""
+    """Sampled light of all planned pixels; denoised where the settings ask for it and all of the drogue is matt.
+
+    Args:
+        request: gives frame and settings.
+        scene: set up for the frame.
+        eyes: passes of both eyes.
+        planned: what to trace, and what `CenterPasses.narrow_parts` gives.
+    """
     frame, settings = request.frame, request.settings
+    plans, narrow = planned
     centers = _center_pixels(eyes, plans)
     matt = frame.drogue is not None and frame.drogue.satin is None and not scene.shiny_parts & _OF_DROGUE
     denoise = settings.denoise and matt and any(len(pixel) > 0 for pixel in centers.values())
@@ -113,18 +129,25 @@ def _sample_light(
     pixel = rays.pixels_of_both_eyes(plans, "context")
     seen = SeenContext(
         covered=np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES]),
-        shiny=_near_parts(eyes, scene.shiny_parts - _OF_DROGUE, moves_px),
+        shiny=_near_parts(eyes, narrow, parts_table(scene.shiny_parts - _OF_DROGUE), moves_px),
+        narrow=_near_parts({}, narrow, _ANY_PART, moves_px),
         lamps=_near_lamps(frame, scene, rays, moves_px),
     )
     return sampled.with_pixels(pixel, trace_context(rays, pixel, seen, settings, moves_px))
 
 
-def _near_parts(eyes: dict[Eye, TracedEye], parts: set[int], moves_px: float) -> NDArray[np.bool_]:
-    """(2 H W,) which pixels of both eyes may see some parts."""
-    table = parts_table(parts)
+def _near_parts(
+    eyes: dict[Eye, TracedEye], narrow: dict[Eye, NDArray[np.uint8]], table: NDArray[np.uint8], moves_px: float
+) -> NDArray[np.bool_]:
+    """(2 H W,) which pixels may see parts that a table marks, at the centres of both eyes or where they are narrow."""
     kernel = np.ones((3 + 2 * int(np.ceil(moves_px)),) * 2, dtype=np.uint8)
-    near = [cv2.dilate(parts_in(eyes[eye].part_id, table).astype(np.uint8), kernel) > 0 for eye in EYES]
-    return np.concatenate([seen.reshape(-1) for seen in near])
+    near = []
+    for eye in EYES:
+        marked = parts_in(narrow[eye], table)
+        if eye in eyes:
+            marked |= parts_in(eyes[eye].part_id, table)
+        near.append((cv2.dilate(marked.astype(np.uint8), kernel) > 0).reshape(-1))
+    return np.concatenate(near)
 
 
 def _near_lamps(frame: FrameSpec, scene: DrogueScene, rays: FrameRays, moves_px: float) -> NDArray[np.bool_]:
@@ -176,7 +199,7 @@ class CenterPasses:
         self._scene = scene
         camera = frame.rig.camera
         self._shape = (camera.height_px, camera.width_px)
-        self._rig = frame.rig
+        self._rig, self._eye = frame.rig, eye
 
     def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
         return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
@@ -201,6 +224,24 @@ class CenterPasses:
                 (left, top), (right, bottom) = window
                 held[top:bottom, left:right] = True
         return np.flatnonzero(held)
+
+    def narrow_parts(self) -> NDArray[np.uint8]:
+        """(H, W) ids of parts narrower than a pixel at mid-exposure, where their edges are; 0 elsewhere."""
+        ids = np.zeros(self._shape, dtype=np.uint8)
+        camera, eye_from_stage = self._rays.camera, self._rays.stage_from_eye(0.0).inverse()
+        for surface in self._scene.surfaces:
+            edges, thickness_m = surface.painted.narrow_edges
+            if not len(edges):
+                continue
+            ends = (eye_from_stage @ surface.axes_from_mesh).apply(surface.painted.mesh.vertices)[edges]
+            nearest_m = ends[..., 2].min(axis=1)
+            narrow = (nearest_m > NEAREST_M) & (thickness_m * camera.fx_px < _NARROW_PX * nearest_m)
+            if narrow.any():
+                first, last = np.moveaxis(self._rig.real_px(camera.project(ends[narrow]), self._eye), 1, 0)
+                column, row = _pixels_on_lines(first, last).T
+                inside = (column >= 0) & (column < self._shape[1]) & (row >= 0) & (row < self._shape[0])
+                ids[row[inside], column[inside]] = surface.part_id
+        return ids
 
     def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
         """(H, W) where the rays of `part_ids` at time s hit surfaces of the drogue that the sun lights."""
@@ -268,3 +309,12 @@ class CenterPasses:
             return {}
         alone_id, alone_m = self._hits(self._scene.features, self._center_rays(jit_array(mi.UInt32, pixel)))
         return amodal_counts(part_id.reshape(-1)[pixel], distance_m.reshape(-1)[pixel], alone_id, alone_m)
+
+
+def _pixels_on_lines(first: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N, 2) column and row of points at most a pixel apart on lines between (E, 2) ends. [px]"""
+    steps = np.ceil(np.abs(last - first).max(axis=1)).astype(np.int64) + 1
+    line = np.repeat(np.arange(len(steps)), steps)
+    step = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
+    share = (step / np.maximum(steps[line] - 1, 1))[:, None]
+    return np.rint(first[line] + share * (last - first)[line]).astype(np.int64)

@@ -8,20 +8,16 @@ each part takes as many paths as lessen the error of the picture most: a dark st
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP
 from geometry.se3 import Array
 from render.compositing import Compositor
-from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.paths.denoised_paths import LEAST_TIMES, MOST_TIMES, DenoisedPaths
 from render.mitsuba_engine.paths.rays import FrameRays, StratifiedSamples, chunks_by_count, rows_of
-from render.mitsuba_engine.paths.received_light import matt_points, trace_received
+from render.mitsuba_engine.paths.received_light import trace_received
 from render.mitsuba_engine.paths.surface_cells import SurfaceCells
 from render.mitsuba_engine.paths.surface_light import SurfaceLight
 from render.mitsuba_engine.render_noise import MOST_COUNT, NoiseBudget
@@ -116,11 +112,6 @@ class SharedLight(SurfaceLight):
     def __init__(self, rays: FrameRays, pixel: NDArray[np.int64], lookup_px: float, least_step_m: float) -> None:
         """Find surfaces and neighbours; arguments as for `SurfaceLight`, and the least step of the lattice. [m]"""
         super().__init__(rays, pixel, lookup_px)
-        surface = self._surface(jit_array(mi.UInt32, pixel))
-        shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
-        self._points = matt_points(surface, dr.gather(mi.Float, rays.lights.open_to_sky, shape))
-        # Otherwise each use of them would trace the rays again.
-        dr.eval(self._points)
         # Blurred light would move the centroids of markers.
         self._is_marker = self._part_of_row % INSTANCE_STEP >= FIRST_MARKER_ID
         steps = np.where(self._is_marker, _STEPS_ON_MARKERS, _STEPS_PER_SMOOTHING).astype(np.float32)

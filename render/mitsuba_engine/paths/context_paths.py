@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
-from render.mitsuba_engine.paths.denoised_paths import MOST_SMOOTHING_STEPS, denoised_light, grid_count
+from render.mitsuba_engine.paths.denoised_paths import MOST_SMOOTHING_STEPS, denoised_edge_light, denoised_light
 from render.mitsuba_engine.paths.drogue_paths import mean_radiance
 from render.mitsuba_engine.paths.rays import FrameRays
 from render.mitsuba_engine.paths.surface_light import SurfaceLight
@@ -23,6 +23,9 @@ from render.mitsuba_engine.trace_request import CONTEXT_DEPTH
 _LATTICE_STEP_PX = 3
 # A sheen takes so many times the paths of matt paint, and the pixels around a lamp so many times the rays.
 _TIMES_AT_SHEEN, _TIMES_AT_LAMPS = 16, 16
+# Where neighbours differ by more than this share, or a part is narrower than a pixel, so many times the rays leave a
+# twentieth of the contrast as noise.
+_SHARP, _TIMES_WHERE_SHARP = 0.25, 4
 # Neighbours that differ by no more than this share show one surface in one light.
 _EVEN = 0.05
 
@@ -35,11 +38,13 @@ class SeenContext:
         covered: (2 H W,) which see something at their centre.
         shiny: (2 H W,) which may see a surface with a sheen, whose light cannot be smoothed.
         lamps: (2 H W,) which may see a lamp, smaller than a pixel perhaps.
+        narrow: (2 H W,) which may see a part that is narrower than a pixel.
     """
 
     covered: NDArray[np.bool_]
     shiny: NDArray[np.bool_]
     lamps: NDArray[np.bool_]
+    narrow: NDArray[np.bool_]
 
 
 def trace_context(
@@ -71,14 +76,17 @@ def trace_context(
         rest = mean_radiance(rays, pixel[~shiny], count, CONTEXT_DEPTH)
         found[~shiny] = rest.radiance_and_coverage()
         return found
-    light = SurfaceLight(rays, center, _LATTICE_STEP_PX + moves_px, _LATTICE_STEP_PX)
+    light = SurfaceLight(rays, center, _LATTICE_STEP_PX + moves_px, _LATTICE_STEP_PX, fills_gaps=True)
     chosen = np.ones(len(center), dtype=np.bool_)
-    light.trace([(chosen, grid_count(count * _LATTICE_STEP_PX**2 / 4))], CONTEXT_DEPTH)
+    light.trace([], CONTEXT_DEPTH, (chosen, 2 ** round(np.log2(max(count * _LATTICE_STEP_PX**2 / 4, 1)))))
     light.smooth(chosen, _LATTICE_STEP_PX * MOST_SMOOTHING_STEPS)
     found[~shiny] = denoised_light(rays, light, pixel[~shiny], 1, at_edges=True)[:, :4]
-    uneven = _uneven(rays, pixel, found) & ~shiny
-    for again, times in ((uneven & ~seen.lamps[pixel], 1), (seen.lamps[pixel] & ~shiny, _TIMES_AT_LAMPS)):
-        found[again] = denoised_light(rays, light, pixel[again], times * count, at_edges=True)[:, :4]
+    contrast = _contrast(rays, pixel, found)
+    times = np.where(contrast > _EVEN, 1, 0)
+    times[(contrast > _SHARP) | seen.narrow[pixel]] = _TIMES_WHERE_SHARP
+    times[seen.lamps[pixel]] = _TIMES_AT_LAMPS
+    again = (times > 0) & ~shiny
+    found[again] = denoised_edge_light(rays, light, pixel[again], times[again] * count)[:, :4]
     return found
 
 
@@ -92,16 +100,16 @@ def _lattice(rays: FrameRays, pixel: NDArray[np.int64]) -> NDArray[np.int64]:
     return step * (down * rays.width_px + right)
 
 
-def _uneven(rays: FrameRays, pixel: NDArray[np.int64], found: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(P,) which pixels differ from one of their eight neighbours; pixels that were not traced count as dark."""
+def _contrast(rays: FrameRays, pixel: NDArray[np.int64], found: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(P,) share by which each pixel and its eight neighbours differ; pixels that were not traced count as dark."""
     radiance = np.zeros((2 * rays.size // rays.width_px, rays.width_px), dtype=np.float32)
     radiance.reshape(-1)[pixel] = found[:, :3].sum(axis=1)
     rows = np.flatnonzero(radiance.any(axis=1))
     if not len(rows):
-        return np.zeros(len(pixel), dtype=np.bool_)
+        return np.zeros(len(pixel), dtype=np.float32)
     window, neighbours = slice(max(rows[0] - 1, 0), rows[-1] + 2), np.ones((3, 3), dtype=np.uint8)
     most = cv2.dilate(radiance[window], neighbours)
-    uneven = np.zeros(radiance.shape, dtype=np.bool_)
-    uneven[window] = most - cv2.erode(radiance[window], neighbours) > _EVEN * most
-    marked: NDArray[np.bool_] = uneven.reshape(-1)[pixel]
-    return marked
+    contrast = np.zeros(radiance.shape, dtype=np.float32)
+    contrast[window] = (most - cv2.erode(radiance[window], neighbours)) / np.maximum(most, np.float32(1e-30))
+    of_pixels: NDArray[np.float32] = contrast.reshape(-1)[pixel]
+    return of_pixels

@@ -30,6 +30,8 @@ from render.mitsuba_engine.trace_request import OPEN_TO_SKY, SamplingPlan
 
 MOST_SMOOTHING_STEPS = 2.5
 """Largest standard deviation of the smoothing, in steps from one traced pixel centre to the next."""
+PATHS_BESIDE = 8
+"""Paths from each centre on surfaces beside the drogue for each of two estimates: for a picture without speckles."""
 # `samples_per_px` paths are traced where the smoothing is this wide; narrower smoothing takes more.
 _SMOOTHING_AT_COUNT_PX = 2.4
 LIGHT_SHARE = 0.5
@@ -47,11 +49,13 @@ class _CenterLight:
     Attributes:
         light: traced and smoothed.
         hidden: (P,) at which centres much of the sky is hidden.
+        drogue: (P,) which centres see no surface beside the drogue, whose light is smooth in any case.
         paths: (2,) from each centre where the sky is hidden, and in the open, for each of two estimates.
     """
 
     light: SurfaceLight
     hidden: NDArray[np.bool_]
+    drogue: NDArray[np.bool_]
     paths: NDArray[np.float64]
 
 
@@ -116,8 +120,8 @@ class DenoisedPaths:
         light = SurfaceLight(self._rays, pixel, 1 + self._moves_px)
         paths = np.array([self._paths_where_hidden(), self._settings.open_samples_per_px]) / 2
         self._trace_light(light, hidden, paths)
-        light.smooth(hidden, MOST_SMOOTHING_STEPS)
-        return _CenterLight(light=light, hidden=hidden, paths=paths)
+        light.smooth(hidden | light.beside, MOST_SMOOTHING_STEPS)
+        return _CenterLight(light=light, hidden=hidden, drogue=~light.beside, paths=paths)
 
     def _paths_where_hidden(self) -> float:
         """Paths from each centre where much of the sky is hidden."""
@@ -130,7 +134,8 @@ class DenoisedPaths:
     def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]) -> None:
         """Trace the light of all centres; `paths` as in `_CenterLight`."""
         of_hidden, of_open = (grid_count(count) for count in paths)
-        light.trace([(hidden, of_hidden), (~hidden, of_open)], self._settings.max_depth)
+        on_drogue = [(hidden & ~light.beside, of_hidden), (~hidden & ~light.beside, of_open)]
+        light.trace(on_drogue, self._settings.max_depth, (light.beside, PATHS_BESIDE))
 
     def _meet_budget(
         self,
@@ -155,7 +160,7 @@ class DenoisedPaths:
         budget = self._budget(light, compositor, edges, (pixel, interior_light))
         if budget.light_error.sum() > LEAST_TIMES * LIGHT_SHARE * budget.aim:
             # In this frame something close hides the sky also from parts that are usually in the open.
-            light.smooth(~hidden, MOST_SMOOTHING_STEPS)
+            light.smooth(~hidden & centered.drogue, MOST_SMOOTHING_STEPS)
             interior_light = self._interior_light(light, pixel)
             budget = self._budget(light, compositor, edges, (pixel, interior_light))
             if self._trace_more(centered, budget):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,6 +29,8 @@ from render.mitsuba_engine.scene import DrogueScene, as_mitsuba_reads, by_shape
 from render.mitsuba_engine.trace_request import SamplingPlan
 from scenes.environment_radiance import EnvironmentRadiance
 
+# A number of this many bits is exact in a float; rows and columns of a lattice have so many each.
+_UNIT_BITS, _LATTICE_BITS = 24, 11
 MOST_LANES = 2_000_000
 """Most lanes of one kernel launch: bounds memory (about 300 bytes per lane) at no cost in speed."""
 
@@ -242,7 +245,7 @@ class StratifiedSamples:
         """(P, len(channels)) means over the samples of each pixel."""
         # Without this evaluation every sum would trace the rays again.
         dr.eval(channels)
-        block = LEAST_COUNT if not (self._counts % LEAST_COUNT).any() else 1
+        block = math.gcd(LEAST_COUNT, *np.unique(self._counts).tolist())
         blocks = [dr.block_sum(channel, block) if block > 1 else channel for channel in channels]
         sums = [np.add.reduceat(np.array(values), self._first // block) for values in blocks]
         means: NDArray[np.float32] = np.stack(sums, axis=-1) / self._counts[:, None].astype(np.float32)
@@ -257,16 +260,42 @@ def chunks_by_count(pixel: NDArray[np.int64], counts: NDArray[np.int64]) -> Iter
             yield pixel[rows], counts[rows]
 
 
-def _sobol(index: mi.UInt32, initial: tuple[int, ...]) -> mi.UInt32:
-    """One dimension of the Sobol sequence as 32-bit binary fractions, for indices below `MOST_COUNT`.
+def stratified_over_image(rays: FrameRays, place: tuple[NDArray[np.int64], NDArray[np.int64]], count: int) -> Any:
+    """2-D numbers for `count` neighbouring lanes of each place of a lattice, stratified over neighbouring places too.
+
+    The places take the points of one Sobol sequence in the order of a curve through the lattice, so that all blocks of
+    2^k x 2^k places together are as evenly filled as one place of as many samples. What is smoothed over the lattice
+    then has much less noise.
+
+    Source: A. G. M. Ahmed and P. Wonka, Screen-space blue-noise diffusion of Monte Carlo sampling error via
+    hierarchical ordering of pixels, ACM Transactions on Graphics 39 (2020), 244, doi:10.1145/3414685.3417881.
+
+    Args:
+        rays: of the frame.
+        place: (P,) rows and columns.
+        count: a power of two.
+    """
+    order = sum((place[axis] >> bit & 1) << (2 * bit + 1 - axis) for axis in range(2) for bit in range(_LATTICE_BITS))
+    lane = dr.arange(mi.UInt32, len(place[0]) * count)
+    of_place = lane // dr.opaque(mi.UInt32, count)
+    index = dr.gather(mi.UInt32, jit_array(mi.UInt32, order * count), of_place) + lane - of_place * mi.UInt32(count)
+    flips = [dr.opaque(mi.UInt32, int(bits[0])) for bits in rays.random_bits(2, 1)]
+    return mi.Point2f(
+        _unit_interval(dr.brev(index) ^ flips[0]), _unit_interval(_sobol(index, (1,), _UNIT_BITS) ^ flips[1])
+    )
+
+
+def _sobol(index: mi.UInt32, initial: tuple[int, ...], bits_of_index: int = MOST_COUNT.bit_length() - 1) -> mi.UInt32:
+    """One dimension of the Sobol sequence as 32-bit binary fractions.
 
     Args:
         index: positions in the sequence.
         initial: first numbers of its recurrence, as many as the degree of its polynomial, whose coefficients are 1.
+        bits_of_index: further bits of the positions are 0.
     """
     numbers = list(initial)
     bits = mi.UInt32(0)
-    for place in range(MOST_COUNT.bit_length() - 1):
+    for place in range(bits_of_index):
         if place >= len(initial):
             degree = len(initial)
             number = numbers[-degree] << degree ^ numbers[-degree]
@@ -280,4 +309,4 @@ def _sobol(index: mi.UInt32, initial: tuple[int, ...]) -> mi.UInt32:
 
 def _unit_interval(bits: mi.UInt32) -> mi.Float:
     """A 32-bit binary fraction as a number in [0, 1)."""
-    return mi.Float(bits >> 8) * mi.Float(2.0**-24)
+    return mi.Float(bits >> 32 - _UNIT_BITS) * mi.Float(2.0**-_UNIT_BITS)

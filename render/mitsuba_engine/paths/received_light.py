@@ -73,9 +73,7 @@ def trace_received(rays: FrameRays, points: MattPoints, first: Any, max_depth: i
         sampler = rays.sampler(dr.width(lane), 1)
         ray = _towards(points, first if bounce == 0 else sampler.next_2d())
         if bounce == max_depth - 2:
-            hit = rays.scene.ray_test(ray)
-            light = unknown_sky(rays.scene, ray, mi.Bool(True), hit, points.known)
-            _add(total, weight * light, lane)
+            _add(total, weight * _sky_along(rays, ray, points.known, mi.Bool(True)), lane)
             break
         surface = rays.scene.ray_intersect(ray, mi.RayFlags.All, False)
         hit = surface.is_valid()
@@ -97,6 +95,25 @@ def trace_received(rays: FrameRays, points: MattPoints, first: Any, max_depth: i
         weight, lane = dr.gather(mi.Color3f, next_weight, row), dr.gather(mi.UInt32, lane, row)
     dr.eval(total)
     return total
+
+
+def sky_received(rays: FrameRays, points: MattPoints, first: Any, active: Any) -> Any:
+    """The same by the sky alone: other surfaces only hide it.
+
+    Args:
+        rays: of the frame.
+        points: where the paths start.
+        first: 2-D random numbers of the directions.
+        active: which paths are wanted; the others give 0.
+
+    Returns:
+        Irradiance over pi by the points. [cd/m2]
+    """
+    return _sky_along(rays, _towards(points, first), points.known, active)
+
+
+def _sky_along(rays: FrameRays, ray: Any, known: Any, active: Any) -> Any:
+    return unknown_sky(rays.scene, ray, active, rays.scene.ray_test(ray, active), known)
 
 
 def _towards(points: MattPoints, numbers: Any) -> Any:

@@ -19,15 +19,20 @@ from numpy.typing import NDArray
 
 from drogue_models.parts import Part
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.rays import FrameRays, means_by_pixel, rows_of
+from render.mitsuba_engine.paths.rays import FrameRays, means_by_pixel, rows_of, stratified_over_image
+from render.mitsuba_engine.paths.received_light import matt_points, sky_received
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct, trace_residual
 from render.mitsuba_engine.scene import by_shape
+from render.mitsuba_engine.trace_request import DROGUE_PARTS
 
 SMOOTHING_M = 0.008
 """Standard deviation of the smoothing on a surface: ribs are this wide. [m]"""
 # Light on the hub is even; the walls of the coupling's recess of 0.1 m darken quickly with depth. Sky shadows under a
-# wing are as wide as pods are thick. [m]
+# wing are as wide as pods are thick; those on probe and hose as wide as these are. [m]
 _SMOOTHING_BY_PART_M = {Part.HUB: 0.016, Part.COUPLING: 0.005, Part.TANKER: 0.25}
+_SMOOTHING_BESIDE_M = 0.03
+# Along a surface that is seen at a grazing angle, a pixel is at most so many times as long as across.
+_MOST_FORESHORTENING = 8.0
 # A neighbour counts as on the same plane within this distance [m], or this share of the reach: large parts are round.
 _SAME_PLANE_M = 0.005
 _SAME_PLANE_PER_REACH = 0.25
@@ -36,14 +41,27 @@ _NORMAL_POWER = 4
 _LEAST_REFLECTANCE = 1e-4
 # Weight of neighbours on other surfaces: their light is the best estimate where no other is near.
 _WEIGHT_ROUND_CORNERS = 1e-4
+# A ray whose nearest centres weigh less than this sees a surface that no centre does.
+_LEAST_KNOWN_WEIGHT = 0.01
 # Weight of the part's mean light, which is used where no centre nearby sees the surface.
 _LEAST_WEIGHT = 1e-8
 
 
 class SurfaceLight:
-    """Indirect irradiance over pi on the surfaces that some pixel centres see."""
+    """Indirect irradiance over pi on the surfaces that some pixel centres see.
 
-    def __init__(self, rays: FrameRays, pixel: NDArray[np.int64], lookup_px: float, step_px: int = 1) -> None:
+    Attributes:
+        beside: (P,) which centres see a matt surface that is not a drogue's.
+    """
+
+    def __init__(
+        self,
+        rays: FrameRays,
+        pixel: NDArray[np.int64],
+        lookup_px: float,
+        step_px: int = 1,
+        fills_gaps: bool = False,
+    ) -> None:
         """Find the surfaces at pixel centres.
 
         Args:
@@ -52,7 +70,10 @@ class SurfaceLight:
                 `step_px`.
             lookup_px: rays look up the light of centres within about so many pixels.
             step_px: distance between the centres.
+            fills_gaps: whether a ray to a surface that no centre near by sees takes a path of its own, for the light of
+                the sky alone.
         """
+        self._fills_gaps = fills_gaps
         self._rays, self.pixel, self._lookup_px, self._step_px = rays, pixel, lookup_px, step_px
         self._none = len(pixel)
         self._columns = -(-rays.width_px // step_px)
@@ -65,13 +86,19 @@ class SurfaceLight:
         # Otherwise each use of them would trace the rays again.
         normal = surface.sh_frame.n
         dr.eval(normal, surface.p, surface.t, shape)
-        smoothing_m = np.full(256, SMOOTHING_M, dtype=np.float32)
+        smoothing_m = np.where(DROGUE_PARTS > 0, np.float32(SMOOTHING_M), np.float32(_SMOOTHING_BESIDE_M))
         for part, part_m in _SMOOTHING_BY_PART_M.items():
             smoothing_m[part] = part_m
         self._smoothing_m = dr.gather(mi.Float, jit_array(mi.Float, by_shape(rays.scene, smoothing_m)), shape)
         self._part = jit_array(mi.UInt32, by_shape(rays.scene, np.arange(256, dtype=np.uint32)))
         self._part_of_row = np.array(dr.gather(mi.UInt32, self._part, shape))
-        known = np.array(dr.gather(mi.Float, rays.lights.open_to_sky, shape))
+        self._points = matt_points(surface, dr.gather(mi.Float, rays.lights.open_to_sky, shape))
+        dr.eval(self._points)
+        known = np.array(self._points.known)
+        self.beside: NDArray[np.bool_] = (DROGUE_PARTS[self._part_of_row] == 0) & (known > 0)
+        length = _foreshortening(surface)
+        dr.eval(length)
+        self._pixel_length = jit_array(mi.Float, np.where(self.beside, np.array(length), np.float32(1.0)))
         self._normal, self._point = _rows(normal, known), _rows(surface.p, np.array(surface.t))
         self._mean = self._error = self._point
 
@@ -79,14 +106,23 @@ class SurfaceLight:
         ray = self._rays.through(pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
         return self._rays.scene.ray_intersect(ray, mi.RayFlags.ShadingFrame, True)
 
-    def trace(self, chosen: list[tuple[NDArray[np.bool_], int]], max_depth: int) -> None:
+    def trace(
+        self,
+        chosen: list[tuple[NDArray[np.bool_], int]],
+        max_depth: int,
+        of_sky: tuple[NDArray[np.bool_], int],
+    ) -> None:
         """Trace paths; their means replace the light so far.
 
         Args:
             chosen: (P,) masks of pixels, and the number of paths from each of them for each of two estimates.
             max_depth: longest path in segments.
+            of_sky: the same for the light of the sky alone; the number is a power of two.
         """
         halves = np.zeros((2, self._none + 257, 4), dtype=np.float32)
+        mask, count = of_sky
+        for half in halves:
+            half[np.flatnonzero(mask), :3] = self._sky_means(np.flatnonzero(mask), count)
         for mask, count in chosen:
             place = np.flatnonzero(mask)
             # Each pixel twice: the samples of one pixel are stratified, so that their halves would not be independent.
@@ -124,6 +160,18 @@ class SurfaceLight:
         reflectance = surface.bsdf(ray).eval_diffuse_reflectance(surface, hit)
         return means_by_pixel([*(rest / dr.maximum(reflectance, _LEAST_REFLECTANCE))], count)
 
+    def _sky_means(self, row: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+        """(P, 3) means over paths that end at the next surface. [cd/m2]"""
+        found = [np.zeros((0, 3), dtype=np.float32)]
+        lattice = [place // self._step_px for place in np.divmod(self.pixel, self._rays.width_px)]
+        for chunk in self._rays.launch_chunks(row, count):
+            if len(chunk):
+                first = stratified_over_image(self._rays, (lattice[0][chunk], lattice[1][chunk]), count)
+                of_lane = dr.arange(mi.UInt32, len(chunk) * count) // dr.opaque(mi.UInt32, count)
+                points = self._points.at(dr.gather(mi.UInt32, jit_array(mi.UInt32, chunk), of_lane))
+                found.append(means_by_pixel([*sky_received(self._rays, points, first, mi.Bool(True))], count))
+        return np.concatenate(found)
+
     def smooth(self, mask: NDArray[np.bool_], most_px: float) -> None:
         """Replace the light of some pixels by weighted means over their neighbours.
 
@@ -136,7 +184,8 @@ class SurfaceLight:
             return
         normal, point = (_gathered(rows, row) for rows in (self._normal, self._point))
         pixel = jit_array(mi.UInt32, self.pixel[mask])
-        sigma_m = dr.minimum(dr.gather(mi.Float, self._smoothing_m, row), self._width_m(point.w, most_px))
+        most_m = self._width_m(point.w, most_px) * dr.gather(mi.Float, self._pixel_length, row)
+        sigma_m = dr.minimum(dr.gather(mi.Float, self._smoothing_m, row), most_m)
         mean, error = self._neighbour_means(pixel, (normal, point), sigma_m, math.ceil(2 * most_px / self._step_px))
         smoothed = [dr.copy(self._mean), dr.copy(self._error)]
         for rows, values in zip(smoothed, (mean, error), strict=True):
@@ -155,13 +204,15 @@ class SurfaceLight:
             Light of the centres that see the same surface, or the mean over its part where none does, and its error.
             [cd/m2]
         """
-        reach_m = dr.maximum(self._width_m(surface.t, self._lookup_px), SMOOTHING_M)
+        reach_m = self._width_m(surface.t, self._lookup_px)
+        if self._fills_gaps:
+            reach_m *= _foreshortening(surface)
+        reach_m = dr.maximum(reach_m, SMOOTHING_M)
         row = pixel // self._rays.width_px
         column = pixel - row * self._rays.width_px
         # The first of the four centres around the ray.
-        corner = self._cell(
-            row - dr.select(place.y < 0.5, mi.UInt32(1), 0), column - dr.select(place.x < 0.5, mi.UInt32(1), 0)
-        )
+        up, left = (place.y < 0.5) & (row > 0), (place.x < 0.5) & (column > 0)
+        corner = self._cell(row - dr.select(up, mi.UInt32(1), 0), column - dr.select(left, mi.UInt32(1), 0))
         shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
         part = dr.opaque(mi.UInt32, self._none + 1) + dr.gather(mi.UInt32, self._part, shape, surface.is_valid())
         total: Any = mi.Float(_LEAST_WEIGHT)
@@ -172,7 +223,13 @@ class SurfaceLight:
             mean += weight * _gathered(self._mean, row)
             error += weight * _gathered(self._error, row)
             total += weight
-        return mi.Color3f(mean.xyz / total), mi.Color3f(error.xyz / total)
+        light, error = mi.Color3f(mean.xyz / total), mi.Color3f(error.xyz / total)
+        if self._fills_gaps:
+            lost = surface.is_valid() & (total < _LEAST_KNOWN_WEIGHT)
+            numbers = self._rays.sampler(dr.width(pixel), 1).next_2d()
+            own = sky_received(self._rays, matt_points(surface, known), numbers, lost)
+            light = dr.select(lost, own, light)
+        return light, error
 
     def at_center(self, pixel: Any) -> tuple[Any, Any]:
         """Light on the surfaces at the centres of pixels, and its error. [cd/m2]"""
@@ -238,6 +295,11 @@ class SurfaceLight:
         off_plane = dr.dot(away, normal) / dr.maximum(_SAME_PLANE_PER_REACH * reach_m, _SAME_PLANE_M)
         same = facing * dr.exp(-off_plane * off_plane) + _WEIGHT_ROUND_CORNERS
         return dr.select(normal_there.w == known, same * dr.exp(-0.5 * dr.dot(away, away) / dr.square(reach_m)), 0.0)
+
+
+def _foreshortening(surface: Any) -> Any:
+    """Length over width of a pixel's image on surfaces, at most `_MOST_FORESHORTENING`."""
+    return 1.0 / dr.maximum(dr.abs(surface.wi.z), 1.0 / _MOST_FORESHORTENING)
 
 
 def _gathered(rows: Any, row: Any) -> Any:
