@@ -317,4 +317,5 @@ def _pixels_on_lines(first: NDArray[np.float64], last: NDArray[np.float64]) -> N
     line = np.repeat(np.arange(len(steps)), steps)
     step = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
     share = (step / np.maximum(steps[line] - 1, 1))[:, None]
-    return np.rint(first[line] + share * (last - first)[line]).astype(np.int64)
+    pixels: NDArray[np.int64] = np.rint(first[line] + share * (last - first)[line]).astype(np.int64)
+    return pixels
