@@ -91,7 +91,10 @@ def windowed(frame: FrameSpec, left: int, top: int, width: int, height: int) -> 
 
 
 def world_frame(index: int) -> FrameSpec:
-    return sample_frame(load_recipe("world-89", 424242).recipe, index)
+    recipe = load_recipe("world-89", 424242).recipe
+    # These frames were found by streams of the seed alone.
+    frames = recipe.frames.model_copy(update={"stream": ""})
+    return sample_frame(recipe.model_copy(update={"frames": frames}), index)
 
 
 def test_no_holes_on_the_pod_beside_a_moving_drogue(engine: RenderEngine) -> None:
