@@ -134,13 +134,15 @@ class Worker:
         self._output = os.memfd_create("droguekit-worker")
         fcntl.fcntl(self._output, fcntl.F_SETFL, os.O_APPEND)
         output: Connection[Any, Any] = Connection(os.dup(self._output), readable=False)
-        self._process = _CONTEXT.Process(
-            target=_serve, args=(there, output, function, then, os.getpid()), name="droguekit-worker"
-        )
+        self._process = _CONTEXT.Process(target=_serve, args=(there, output, os.getpid()), name="droguekit-worker")
         with one_thread_in_new_processes():
             self._process.start()
         there.close()
         output.close()
+        # Not as arguments of the process: `multiprocessing` waits for ever to hand over more than a pipe holds, such as
+        # a long recipe, to a process that has ended. Here a dead one shows when its answer is received.
+        with suppress(OSError):
+            self.connection.send((function, then))
         self.index: int | None = None
         self.is_ready = False
         self.tasks_done = 0
@@ -202,8 +204,6 @@ class Worker:
 def _serve(
     connection: Connection[Any, Any],
     output: Connection[Any, Any],
-    function: Callable[[int], Any],
-    then: Callable[[int, Any], Any] | None,
     parent: int,
 ) -> None:
     """The main loop of a worker: answers each index with (value, error, resident memory in GiB)."""
@@ -214,6 +214,10 @@ def _serve(
         os.dup2(output.fileno(), standard)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a cluster sends it to every process of a job; the parent decides
     _die_with_parent(parent)
+    try:
+        function, then = connection.recv()
+    except EOFError:
+        return
     connection.send(READY)
     while True:
         try:

@@ -277,13 +277,29 @@ def test_an_error_that_cannot_cross_processes_says_the_same(tasks: ModuleType) -
 
 def test_workers_that_cannot_start_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "broken_tasks.py").write_text(
-        "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os._exit(3)\ndef task(index): return 0\n"
+        "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os._exit(3)\ndef task(load, index): return 0\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     import broken_tasks  # type: ignore[import-not-found]
 
+    # More than a pipe holds: a dead process never takes it.
+    load = bytes(2**20)
     with pytest.raises(OSError, match=r"end before their first task; the last: .*exit code 3"):
-        list(run_tasks(broken_tasks.task, range(100), 2))
+        list(run_tasks(partial(broken_tasks.task, load), range(100), 2))
+
+
+def test_a_script_without_a_main_guard_ends_with_an_error(tmp_path: Path) -> None:
+    """Its worker processes run it again, and end before they take their function."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from functools import partial\n"
+        "from operator import getitem\n"
+        "from droguekit.batch.worker_pool import run_tasks\n"
+        "list(run_tasks(partial(getitem, bytes(2**20)), range(4), 1))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "OSError: worker processes end before their first task" in done.stderr
 
 
 @pytest.mark.parametrize("wrong", [{"timeout_s": 0}, {"tasks_per_process": 0}, {"process_gib": -1.0}])
