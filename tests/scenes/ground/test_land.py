@@ -72,6 +72,11 @@ def test_lamps_send_out_their_light_at_every_distance(kind: LandKind) -> None:
         assert float(luminance(seen).mean()) == pytest.approx(expected, rel=0.12)
 
 
+def test_land_without_lamps_is_dark() -> None:
+    assert not land_textures("forest").lamps_px
+    assert not lamp_texture("forest").sample(*everywhere(2048 * 4.0, 64, 40.0)).any()
+
+
 def test_lamps_stand_apart_and_differ() -> None:
     seen = lamp_texture("town").sample(*everywhere(800.0, 320, 2.5))
     level = luminance(seen)
