@@ -42,7 +42,7 @@ class Share(FrozenModel):
     interval: Interval
 
 
-class Cell(FrozenModel):
+class DomainCell(FrozenModel):
     """One combination of bins.
 
     Attributes:
@@ -69,10 +69,10 @@ class CrossingCoverage(FrozenModel):
     of: tuple[str, ...]
     fewest_pairs: int
     outside: int
-    cells: tuple[Cell, ...]
+    cells: tuple[DomainCell, ...]
 
     @property
-    def lacking(self) -> tuple[Cell, ...]:
+    def lacking(self) -> tuple[DomainCell, ...]:
         """Cells with fewer pairs than they need."""
         return tuple(cell for cell in self.cells if cell.pairs < self.fewest_pairs)
 
@@ -232,7 +232,7 @@ def _crossing(
             for name, counts in tally.counts.items()
             if counts[cell]
         }
-        cells.append(Cell(bins=cell, pairs=tally.pairs[cell], scores=scores))
+        cells.append(DomainCell(bins=cell, pairs=tally.pairs[cell], scores=scores))
     return CrossingCoverage(
         of=crossing.of, fewest_pairs=crossing.fewest_pairs, outside=tally.outside, cells=tuple(cells)
     )
@@ -264,12 +264,12 @@ def coverage_lines(coverage: Coverage) -> Iterator[str]:
                 )
 
 
-def cell_name(crossing: CrossingCoverage, cell: Cell) -> str:
+def cell_name(crossing: CrossingCoverage, cell: DomainCell) -> str:
     """A cell in words."""
     return ", ".join(f"{name} {bin_name}" for name, bin_name in zip(crossing.of, cell.bins, strict=True))
 
 
-def worst_cell(crossing: CrossingCoverage, name: str) -> Cell | None:
+def worst_cell(crossing: CrossingCoverage, name: str) -> DomainCell | None:
     """The cell whose share is surely lowest: the one with the lowest upper end of the interval; None without cases."""
     scored = [cell for cell in crossing.cells if name in cell.scores]
     return min(scored, key=lambda cell: cell.scores[name].interval[1], default=None)

@@ -111,7 +111,7 @@ WORDS: dict[str, Callable[[PairRecord], str | None]] = {
 """Words of a pair, likewise."""
 
 
-class Quantity(FrozenModel):
+class DomainQuantity(FrozenModel):
     """A condition, and how it is cut.
 
     Attributes:
@@ -168,7 +168,7 @@ class DesignDomain(FrozenModel):
     name: str = Field(min_length=1, max_length=80)
     description: str = ""
     most_position_error_fraction: float = Field(default=0.01, gt=0, le=1)
-    quantities: dict[str, Quantity] = Field(min_length=1)
+    quantities: dict[str, DomainQuantity] = Field(min_length=1)
     cells: tuple[Crossing, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -210,7 +210,7 @@ class Placed(NamedTuple):
     applies: bool
 
 
-def _placed(name: str, quantity: Quantity, record: PairRecord) -> Placed:
+def _placed(name: str, quantity: DomainQuantity, record: PairRecord) -> Placed:
     if quantity.edges is None:
         word = WORDS[name](record)
         return Placed(word if word in quantity.bins else None, word is not None)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from jinja2 import Environment, StrictUndefined
 
 from datasets_manifest.atomic import write_text_atomic
-from droguekit.assurance.coverage import Cell, Coverage, CrossingCoverage, Share
+from droguekit.assurance.coverage import Coverage, CrossingCoverage, DomainCell, Share
 from droguekit.assurance.design_domain import DesignDomain
 
 _TEMPLATE = """<!DOCTYPE html>
@@ -156,7 +156,7 @@ def _tables(crossing: CrossingCoverage, domain: DesignDomain) -> Iterator[_Table
         )
 
 
-def _cell(cell: Cell, crossing: CrossingCoverage) -> _ShownCell:
+def _cell(cell: DomainCell, crossing: CrossingCoverage) -> _ShownCell:
     kind = "free" if not crossing.fewest_pairs else "lacks" if cell.pairs < crossing.fewest_pairs else "enough"
     several = len({name for other in crossing.cells for name in other.scores}) > 1
     lines = [(f"{name}: " if several else "") + _share_text(share) for name, share in cell.scores.items()]

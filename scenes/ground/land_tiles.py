@@ -151,10 +151,8 @@ def lamp_texture(kind: LandKind) -> MipTile:
     # Clipping, bending and eight bits take some light: the rest makes up for it.
     sent = len(land.lamps_px) * LAMP_CD / (LAMP_PEAK_CD_M2 * (_SIZE_PX * texel_m) ** 2)
     kept = np.rint(255 * np.sqrt(np.clip(light[..., 1], 0.0, 1.0))) / 255
-    mean = float(np.mean(kept * kept, dtype=np.float64))
-    # Land without towns has no lamps.
-    if mean > 0:
-        light *= np.float32(sent / mean)
+    if kept.any():  # land without towns has no lamps
+        light *= np.float32(sent / float(np.mean(kept * kept, dtype=np.float64)))
     return MipTile(np.clip(light, 0.0, 1.0), texel_m, coded=True)
 
 

@@ -24,7 +24,7 @@ from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 ROOT = Path(__file__).parents[3]
 SOURCES = (
     *sorted((ROOT / "labelgen" / "export").rglob("*.py")),
-    ROOT / "droguekit" / "cli" / "dataset" / "export.py",
+    ROOT / "droguekit" / "cli" / "exchange_commands.py",
 )
 # Words with which a message goes on to say what to do.
 ADVISES = re.compile(r"\b(add|choose|delete|give|install|let|name|run|take|there are|train|use)\b|is for|must lie")
