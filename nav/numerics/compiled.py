@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from contextlib import suppress
-from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from geometry.compiled_loops import kept_on_disk
 
 Array32 = NDArray[np.float32]
 
@@ -34,35 +30,11 @@ _OPTIONS = {
     "error_model": "numpy",
     "nogil": True,
 }
-# In every file that holds compiled functions, this one included.
-_MARK = b"@compiled"
 
 
 def compiled(loop: _Loop) -> _Loop:
-    """Compile a function over arrays at its first call, and keep the result on disk for later processes.
-
-    The result is kept beside the function's file, else in the user's cache folder; where neither can be written, every
-    process compiles anew.
-    """
-    quick: Any = numba.njit(loop, **_OPTIONS)
-    with suppress(RuntimeError):  # numba found no folder that can be written
-        quick._cache = _KernelCache(loop)
-    kernel: _Loop = quick
-    return kernel
-
-
-class _KernelCache(FunctionCache):  # type: ignore[misc]
-    """Numba's cache on disk, which does not see changes in other files whose compiled functions a function calls."""
-
-    def _index_key(self, signature: Any, code_generator: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(signature, code_generator), _sources_digest())
-
-
-@cache
-def _sources_digest() -> str:
-    """Hash of all files of this package that hold compiled functions."""
-    texts = (path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
-    return hashlib.sha256(b"".join(text for text in texts if _MARK in text)).hexdigest()
+    """Compile a function over arrays at its first call, and keep the result on disk; see `kept_on_disk`."""
+    return kept_on_disk(loop, _OPTIONS)
 
 
 @intrinsic  # type: ignore[untyped-decorator]

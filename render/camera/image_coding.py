@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.video_camera import ImageCoding, Overlay, VideoCamera
-from render.camera.sensor_readout import compiled
+from geometry.compiled_loops import compiled
 
 Picture = NDArray[np.uint8]
 

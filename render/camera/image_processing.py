@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import srgb_from_light
 from datasets_manifest.types.video_camera import ImageProcessing
-from render.camera.sensor_readout import compiled
+from geometry.compiled_loops import compiled
 
 Plane = NDArray[np.float32]
 _LEVELS = 256

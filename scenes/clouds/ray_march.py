@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.compiled_loops import compiled
+
 _Field = NDArray[np.float32]
-_Loop = TypeVar("_Loop", bound=Callable[..., Any])
 
 EARTH_M = 6.371e6
 # Shapes of clouds with depth; the numbers are known to the compiled loops.
@@ -27,15 +24,6 @@ _SUN_STEPS = 5
 _FINER = 2.13
 _MASK, _TILE_PX, _LUMPS_MASK = 511, 512.0, 63
 _BLOB_TEXELS, _LUMP_TEXELS = 64.0, 64.0 / 6.0
-
-
-def compiled(loop: _Loop) -> _Loop:
-    """Compile at the first call, and cache the result where possible; no reordering of floating-point operations."""
-    try:
-        quick: _Loop = numba.njit(loop, cache=True, error_model="numpy", nogil=True)
-    except RuntimeError:  # no folder for the cache can be written
-        quick = numba.njit(loop, error_model="numpy", nogil=True)
-    return quick
 
 
 @compiled

@@ -18,7 +18,7 @@ MOST_PEAK_BYTES = MOST_MEMORY_BYTES + MEMORY_BYTES_PER_BYTE * MOST_FILE_BYTES + 
 
 @pytest.mark.slow
 def test_no_reader_takes_more_than_the_stated_memory_for_a_megabyte(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.support.bombs", str(tmp_path)]
+    command = [sys.executable, "-m", "tests.support.peak_memory", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
         found = [json.loads(line) for line in process.stdout]

@@ -262,6 +262,14 @@ def test_calibrations_nested_too_deep_are_refused(name: str, text: str, tmp_path
         read_calibration([tmp_path / name])
 
 
+def test_an_element_of_too_many_numbers_is_refused(tmp_path: Path) -> None:
+    """OpenCV's reader takes minutes for a megabyte of them."""
+    path = tmp_path / "storage.xml"
+    path.write_text('<?xml version="1.0"?><opencv_storage><a>' + "1 " * 450_000 + "</a></opencv_storage>")
+    with pytest.raises(ValueError, match=r"storage\.xml: has an element of more than 25000 numbers"):
+        read_calibration([path])
+
+
 @pytest.mark.parametrize(
     "text",
     [
