@@ -51,7 +51,9 @@ def call(package: Path) -> tuple[int, int, str]:
     """The caller's result in a new process, its number of cache hits, and its cache folder."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
     home = str(package / "home")
-    environment |= {"PYTHONPATH": str(package), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
+    # The other packages are those of this checkout.
+    path = os.pathsep.join([str(package), str(Path(__file__).parents[3])])
+    environment |= {"PYTHONPATH": path, "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", CALL]
     done = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=True)
     value, hits, *where = done.stdout.split()
