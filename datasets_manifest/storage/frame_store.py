@@ -8,7 +8,7 @@ import tarfile
 from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
-from typing import IO, Annotated, Any, BinaryIO, Literal, NamedTuple, Self, cast
+from typing import IO, Annotated, Any, BinaryIO, Literal, NamedTuple, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -257,15 +257,16 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
     frames: dict[int, dict[str, PackedFile]] = {}
     hashed = _HashedStream(stream)
     try:
-        with tarfile.open(fileobj=cast(IO[bytes], hashed), mode="r|", bufsize=_BLOCK_BYTES) as archive:
-            for member in archive:
-                key, _, name = member.name.partition(".")
-                data, frame_index = archive.extractfile(member), frame_of_name(key)
-                if data is None or frame_index is None:
-                    raise ValueError(f"holds {member.name}, which is not a file of a frame")
-                digest = sha256_of(data)
-                files = frames.setdefault(frame_index, {})
-                files[name] = PackedFile(member.offset_data, member.size, digest)
+        # Header by header, for the library believes extension headers of any size, which archives of frames lack.
+        while any(header := hashed.read(tarfile.BLOCKSIZE)):
+            member, start = tarfile.TarInfo.frombuf(header, tarfile.ENCODING, "surrogateescape"), hashed.size
+            key, _, name = member.name.partition(".")
+            frame_index = frame_of_name(key)
+            if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or member.size < 0 or frame_index is None:
+                raise ValueError(f"holds {member.name}, which is not a file of a frame")
+            frames.setdefault(frame_index, {})[name] = PackedFile(start, member.size, _hash_member(hashed, member.size))
+        if not hashed.size:
+            raise tarfile.ReadError("empty file")
     except tarfile.TarError as error:
         raise ValueError(f"is not a complete tar file: {error}") from error
     while hashed.read(_BLOCK_BYTES):
@@ -274,6 +275,22 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
         return ShardIndex(size=hashed.size, sha256=hashed.digest.hexdigest(), frames=frames)
     except ValidationError as error:
         raise ValueError(explain(error)) from error
+
+
+def _hash_member(stream: _HashedStream, size_bytes: int) -> str:
+    """Hash of the next file of an archive, after which the stream is at the next header.
+
+    Raises:
+        ReadError: of `tarfile`; the stream ends within the file.
+    """
+    digest, left = hashlib.sha256(), size_bytes
+    while left:
+        if not (block := stream.read(min(left, _BLOCK_BYTES))):
+            raise tarfile.ReadError("unexpected end of data")
+        digest.update(block)
+        left -= len(block)
+    stream.read(-size_bytes % tarfile.BLOCKSIZE)
+    return digest.hexdigest()
 
 
 class _HashedStream:

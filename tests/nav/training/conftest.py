@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from nav.training.corpus import CachedPair, Corpus, ImageCache
 from tests.support.shared_folder import shared_folder
 from tests.support.small_datasets import render_toy
@@ -46,4 +47,4 @@ def ellipse_corpus() -> Corpus:
         box = (float(x), float(y), float(width), float(height))
         pairs.append(CachedPair(frame_index=number, split="train", boxes=(box, box)))
     places = np.array([(0, index) for index in range(12)])
-    return Corpus((), (96, 128), (ImageCache(images, tuple(pairs)),), places)
+    return Corpus((), (96, 128), (ImageCache(images, tuple(pairs), PairFaults()),), places)

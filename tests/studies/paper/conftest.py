@@ -45,7 +45,7 @@ def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four pairs of the docking scenes that follow no sequence, 0 and 2 without a drogue; to be read only."""
     source = open_recipe("docking-10m", None, "analytic")
-    frames = source.recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5})
+    frames = source.recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5, "stream": ""})
     recipe = Recipe.model_validate(dict(source.recipe) | {"sequence": None, "frames": frames})
     single = RecipeSource(recipe, source.text)
     folder = shared_folder(tmp_path_factory, "single", lambda out: _render_recipe(out, single, range(4)))
