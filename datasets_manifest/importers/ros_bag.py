@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.reader import Reader as Ros2Reader
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
-from datasets_manifest.importers.bag_chunks import check_bag
+from datasets_manifest.importers.bag_chunks import check_bag, check_database
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.ros_images import RosImage, decode_image, message_stamp_ns
 from datasets_manifest.importers.stamp_pairs import match_stamps, smallest_difference_ns
@@ -26,6 +30,9 @@ from geometry.stereo import EYES, StereoRig
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 _TEXT_TYPE = "std_msgs/msg/String"
+_READ_TYPES = (*_IMAGE_TYPES, _INFO_TYPE, _TEXT_TYPE)
+# The longest definition, that of CameraInfo, has 8000 characters with its comments.
+_MOST_DEFINITION = 2**16
 # A bag may be played into another namespace.
 _PIXEL_VALUES_NAME: Final = PIXEL_VALUES_TOPIC.rsplit("/", 1)[1]
 # Words of the left and the right topic's names; those of RealSense and EuRoC are numbered.
@@ -178,7 +185,7 @@ class RosBag:
         )
         return rig_of_camera_info(left, right, unit_m)
 
-    def _pixel_values(self, reader: AnyReader) -> dict[int, PixelValues] | None:
+    def _pixel_values(self, reader: _BagReader) -> dict[int, PixelValues] | None:
         """What the bag says of the pixel values, by time stamp, or None where it says nothing."""
         topics = {c.topic for c in reader.connections if c.msgtype == _TEXT_TYPE}
         topics = {topic for topic in topics if topic.rsplit("/", 1)[-1] == _PIXEL_VALUES_NAME}
@@ -193,10 +200,10 @@ class RosBag:
             found[values.stamp_ns] = values
         return found or None
 
-    def _messages(self, reader: AnyReader, topics: tuple[str, ...]) -> Iterator[tuple[Connection, Any]]:
+    def _messages(self, reader: _BagReader, topics: tuple[str, ...]) -> Iterator[tuple[Connection, Any]]:
         """Decoded messages of some topics; errors of the reader on damaged bags become a ValueError of one line."""
         connections = [connection for connection in reader.connections if connection.topic in topics]
-        messages = reader.messages(connections=connections) if connections else iter(())
+        messages = reader.messages(connections)
         while True:
             try:
                 # Whoever takes a message takes memory of its own.
@@ -211,11 +218,10 @@ class RosBag:
             yield found[0], message
 
     @contextmanager
-    def _open(self) -> Iterator[AnyReader]:
+    def _open(self) -> Iterator[_BagReader]:
         try:
             with limited_memory(self._file_bytes):
-                reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-                reader.open()
+                reader = _BagReader(self._path)
         except Exception as error:  # whatever a damaged bag makes its reader raise
             message = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(f"{self._path}: cannot be read as a ROS bag: {message}") from error
@@ -225,11 +231,78 @@ class RosBag:
             reader.close()
 
 
-def _topics_of(reader: AnyReader, types: tuple[str, ...]) -> str:
+class _Database(Sqlite3Reader):
+    def open(self) -> None:
+        check_database(Path(str(self.path)))
+        super().open()
+
+
+class _Recording(DirectoryReader):
+    STORAGE_PLUGINS: Mapping[str, Any] = {"mcap": McapReader, "sqlite3": _Database}
+
+
+class _Ros2Reader(Ros2Reader):
+    STORAGE_PLUGINS: Mapping[str, Any] = {"dir": _Recording, ".mcap": McapReader, ".db3": _Database}
+
+
+class _BagReader:
+    """The topics of a bag that are read here, and their messages.
+
+    Definitions of messages that a bag brings along are compared with those of ROS, and not parsed: a parser may take
+    minutes for a hostile one.
+
+    Attributes:
+        connections: the topics.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a bag; whatever a damaged one makes its reader raise is raised."""
+        is_ros1 = path.suffix == ".bag"
+        self._reader: Ros1Reader | _Ros2Reader = Ros1Reader(path) if is_ros1 else _Ros2Reader(path)
+        self._reader.open()
+        try:
+            store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+            self.deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+            self.connections = [each for each in self._reader.connections if each.msgtype in _READ_TYPES]
+            for kind in _READ_TYPES:
+                text, digest = store.generate_msgdef(kind, ros_version=1 if is_ros1 else 2)
+                digest = digest if is_ros1 else store.hash_rihs01(kind)
+                for connection in self.connections:
+                    if connection.msgtype == kind and not _is_defined_as(connection, text, digest):
+                        raise ValueError(f"{connection.topic}: its definition of {kind} is not that of ROS")
+        except BaseException:
+            self._reader.close()
+            raise
+
+    def messages(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+        """Topic, time of recording [ns] and bytes of all messages of some topics."""
+        return self._reader.messages(connections=connections) if connections else iter(())
+
+    def close(self) -> None:
+        """Close the files."""
+        self._reader.close()
+
+
+def _is_defined_as(connection: Connection, text: str, digest: str) -> bool:
+    """Whether a topic's messages are defined by a text and a hash, as far as the bag says."""
+    found = connection.msgdef
+    if (connection.digest and connection.digest != digest) or len(found.data) > _MOST_DEFINITION:
+        return False
+    is_text = found.format == MessageDefinitionFormat.MSG and found.data.strip()
+    return not is_text or _defined_fields(found.data) == _defined_fields(text)
+
+
+def _defined_fields(definition: str) -> list[tuple[str, str]]:
+    """Types, without their packages, and names of a message's fields, without those of the messages within."""
+    lines = (line.partition("#")[0].split() for line in definition.partition("=" * 80)[0].splitlines())
+    return [(words[0].rpartition("/")[2], words[1]) for words in lines if len(words) > 1]
+
+
+def _topics_of(reader: _BagReader, types: tuple[str, ...]) -> str:
     return ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in types})) or "none"
 
 
-def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
+def _stereo_topics(reader: _BagReader) -> tuple[str, str]:
     """The image topics whose names differ in the words for left and right."""
     topics = {c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES}
     topics = {topic for topic in topics if not topic.endswith("/compressedDepth")}

@@ -27,15 +27,22 @@ _LOOK_EVERY_S = 0.02
 # In what surroundings a run starts, and what happens to its finished frames meanwhile.
 SURROUNDINGS = ("usual", "usual", "no home", "full disk", "nobody listens")
 HARMS = ("none", "vanished frame", "damaged file", "half a frame")
+LOOP_HARM = "damaged loop"
 
 
 class KilledRun:
     """A run in processes of its own that is killed now and then, and started again whenever it has ended."""
 
-    def __init__(self, recipe: Path, out: Path, scratch: Path, rng: np.random.Generator) -> None:
+    def __init__(
+        self, recipe: Path, out: Path, scratch: Path, rng: np.random.Generator, loops: Path | None = None
+    ) -> None:
+        """Nothing runs yet; `loops` keeps compiled loops, to be damaged too."""
         self._command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), "--out", str(out)]
         self._out, self._rng = out, rng
         self._environment = {"XDG_CACHE_HOME": "", **os.environ, "TMPDIR": str(scratch)}
+        self._loops = loops
+        if loops is not None:
+            self._environment["NUMBA_CACHE_DIR"] = str(loops)
         self._process: subprocess.Popen[bytes] | None = None
         self.kills = 0
         self.faults: Counter[str] = Counter()
@@ -70,11 +77,17 @@ class KilledRun:
             )
 
     def harm(self) -> None:
-        """Do something to a finished frame, whether the run is at work or not."""
-        kind, there = str(self._rng.choice(HARMS)), layout.frame_indices(self._out)
-        if kind == "none" or not there:
+        """Do something to a finished frame or a compiled loop, whether the run is at work or not."""
+        kinds = HARMS if self._loops is None else (*HARMS, LOOP_HARM)
+        kind, there = str(self._rng.choice(kinds)), layout.frame_indices(self._out)
+        files = [] if self._loops is None else sorted(path for path in self._loops.rglob("*") if path.is_file())
+        if kind == "none" or not (files if kind == LOOP_HARM else there):
             return
         self.faults[kind] += 1
+        if kind == LOOP_HARM:
+            with suppress(FileNotFoundError):
+                self._damage(files[int(self._rng.integers(len(files)))])
+            return
         folder = layout.frame_folder(self._out, int(self._rng.choice(there)))
         name = str(self._rng.choice([layout.RECORD_FILE, "left.png", "right_parts.png"]))
         with suppress(FileNotFoundError):
@@ -83,8 +96,14 @@ class KilledRun:
             elif kind == "half a frame":
                 (folder / name).unlink()
             else:
-                data = (folder / name).read_bytes()
-                (folder / name).write_bytes(data[: int(self._rng.integers(0, len(data)))])
+                self._damage(folder / name)
+
+    def _damage(self, path: Path) -> None:
+        """Cut a file off, or turn over one of its bits."""
+        data = path.read_bytes()
+        place = int(self._rng.integers(0, max(1, len(data))))
+        is_cut = path.suffix not in (".nbi", ".nbc") or self._rng.integers(2) == 0
+        path.write_bytes(data[:place] if is_cut else data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
 
     def frames(self) -> int:
         """Number of finished frames."""
@@ -130,14 +149,21 @@ def _limit_files(most_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
 
-def torture(recipe_text: str, kills: int, folder: Path) -> None:
-    """Kill a run so many times while it renders a recipe, and compare with an undisturbed one."""
+def torture(recipe_text: str, kills: int, folder: Path, loops: Path | None = None) -> None:
+    """Kill a run so many times while it renders a recipe, and compare with an undisturbed one.
+
+    Args:
+        recipe_text: of what is rendered.
+        kills: how many.
+        folder: for all files.
+        loops: folder of compiled loops, which are damaged too.
+    """
     calm, out, recipe, scratch = folder / "calm", folder / "out", folder / "recipe.toml", folder / "scratch"
     recipe.write_text(recipe_text)
     scratch.mkdir()
     planned = render_recipe(calm, text=recipe_text).planned
     rng = np.random.Generator(np.random.Philox(8))
-    run = KilledRun(recipe, out, scratch, rng)
+    run = KilledRun(recipe, out, scratch, rng, loops)
     try:
         while run.kills < kills:
             if kills - run.kills <= max(1, kills // 10):
@@ -176,4 +202,4 @@ def test_kills_at_random_instants_change_nothing(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.torture
 def test_fifty_kills_over_two_hundred_pairs_change_nothing(tmp_path: Path) -> None:
-    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 200"), 50, tmp_path)
+    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 200"), 50, tmp_path, tmp_path / "loops")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import io
 import json
 import os
@@ -251,6 +252,54 @@ def _widen_contents(bag: Path, messages: Path) -> None:
     (bag / "metadata.yaml").write_text("[" + "[]," * 30_000 + "]")
 
 
+def _define_messages(bag: Path, messages: Path) -> None:
+    with sqlite3.connect(messages) as database:
+        database.execute("update message_definitions set encoded_message_definition = ?", ("\n" * 200_000 + "!",))
+
+
+def _offer_topics(bag: Path, messages: Path) -> None:
+    """A chunk in which a channel is offered in a hundred megabytes of YAML."""
+    told = b"[" + b"[]," * (30 * _MIB) + b"]"
+    texts = (b"/a", b"cdr", struct.pack("<I", 20) + b"offered_qos_profiles" + struct.pack("<I", len(told)) + told)
+    channel = bytes(4) + b"".join(struct.pack("<I", len(text)) + text for text in texts)
+    _add_chunks(messages, b"\x04" + struct.pack("<Q", len(channel)) + channel, 1)
+
+
+def _fill_chunks(bag: Path, messages: Path) -> None:
+    """Chunks of messages that expand to many gigabytes."""
+    message = bytes(200 * _MIB)
+    _add_chunks(messages, b"\x05" + struct.pack("<Q", len(message)) + message, 100)
+
+
+def _add_chunks(messages: Path, contents: bytes, count: int) -> None:
+    packed = zstd.compress(contents)
+    chunk = struct.pack("<QQQII", 0, 2**62, len(contents), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    record = b"\x06" + struct.pack("<Q", len(chunk)) + chunk
+    # Without a summary, so that its reader looks at all chunks.
+    data = messages.read_bytes()
+    (summary_start,) = struct.unpack_from("<Q", data, len(data) - 28)
+    body = data[: summary_start - 13] + record * min(count, (MOST_BYTES - summary_start) // len(record))
+    messages.write_bytes(body + b"\x0f" + struct.pack("<QI", 4, 0) + data[-37:-28] + bytes(20) + data[-8:])
+
+
+def _refer_to_topics(bag: Path, messages: Path) -> None:
+    head = (bag / "metadata.yaml").read_text().split("  topics_with_message_count:\n")[0]
+    topic = "{message_count: 0, topic_metadata: {name: a, type: b, serialization_format: cdr, "
+    topic += f"offered_qos_profiles: '[{'[],' * 3000}]'}}}}"
+    topics = f"  topics_with_message_count: [&a {topic}{', *a' * 200_000}]\n"
+    (bag / "metadata.yaml").write_text(f"{head}{topics}")
+
+
+def _ros1_chunks() -> bytes:
+    """Chunks that expand to many gigabytes, of a compression that is slow."""
+    contents = bytes(200 * _MIB)
+    packed = bz2.compress(contents)
+    fields = [b"op=\x05", b"compression=bz2", b"size=" + struct.pack("<I", len(contents))]
+    head = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    chunk = struct.pack("<I", len(head)) + head + struct.pack("<I", len(packed)) + packed
+    return b"#ROSBAG V2.0\n" + chunk * ((MOST_BYTES - 13) // len(chunk))
+
+
 def _hide_chunk(bag: Path, messages: Path) -> None:
     """A chunk within a record of an unknown kind, which only the index of the file leads to."""
     packed, size = _zeros_zstd(3 * _GIB), 3 * _GIB
@@ -444,6 +493,11 @@ BOMBS: dict[str, Bomb] = {
     "bag messages": _bag("bag", _compress_messages),
     "bag columns": _bag("bag", _generate_messages),
     "bag contents": _bag("bag", _widen_contents),
+    "bag definitions": _bag("bag", _define_messages),
+    "bag references": _bag("bag", _refer_to_topics),
+    "bag profiles": _bag("bag", _offer_topics, StoragePlugin.MCAP),
+    "bag chunks": _bag("bag", _fill_chunks, StoragePlugin.MCAP),
+    "bag of ros 1": Bomb(_file("a.bag", _ros1_chunks), RosBag),
     "bag hidden chunk": _bag("bag", _hide_chunk, StoragePlugin.MCAP),
     "onnx constant": Bomb(_file("a.onnx", _constant_network), OnnxDetector),
     "onnx result": Bomb(_file("a.onnx", _growing_network), OnnxDetector),

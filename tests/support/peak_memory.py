@@ -1,4 +1,4 @@
-"""How much memory each reader takes for the worst files.
+"""How much memory and time each reader takes for the worst files.
 
 `python -m tests.support.peak_memory FOLDER NAME...` reads them in processes of their own and prints a line of JSON for
 each.
@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,8 @@ import torch
 
 from tests.support.bombs import BOMBS
 
-_LONGEST_S = 300
+# A reader that takes more of the processor's time, or waits for ever, is ended.
+_MOST_CPU_S, _LONGEST_S = 60, 600
 
 
 def _status_bytes(key: str) -> int:
@@ -35,6 +38,7 @@ def _in_child(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     child = os.fork()
     if child == 0:
         signal.alarm(_LONGEST_S)
+        resource.setrlimit(resource.RLIMIT_CPU, (_MOST_CPU_S, _MOST_CPU_S))
         found: dict[str, Any] = {"fault": "ended"}
         try:
             found = action()
@@ -62,13 +66,14 @@ def measure(name: str, folder: Path) -> dict[str, Any]:
 
     def read() -> dict[str, Any]:
         Path("/proc/self/clear_refs").write_text("5")  # the peak becomes what is held now
-        before, told = _status_bytes("VmRSS"), "read"
+        before, start_s, told = _status_bytes("VmRSS"), time.process_time(), "read"
         try:
             BOMBS[name].read(Path(written["path"]))
         except (ValueError, OSError) as error:
             told = str(error)
         return {
             "peak_bytes": _status_bytes("VmHWM") - before,
+            "cpu_s": round(time.process_time() - start_s, 2),
             "told": told[:2000],
             "lines": told.strip().count("\n") + 1,
         }

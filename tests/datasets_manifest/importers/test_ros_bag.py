@@ -7,6 +7,7 @@ import io
 import json
 import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from tests.support.ros_messages import (
     HUMBLE,
     IMAGE,
     INFO,
+    NOETIC,
     TEXT,
     WIDTH,
     header,
@@ -401,6 +403,116 @@ def test_a_message_that_would_fill_the_memory_is_refused(tmp_path: Path, monkeyp
     with sqlite3.connect(messages) as database:
         database.execute("update messages set data = ?", (bomb,))
     with pytest.raises(ValueError, match=r"flight: is damaged: .*takes more than .* bytes of memory"):
+        RosBag(bag)
+
+
+def mcap_record(opcode: int, data: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(data)) + data
+
+
+def mcap_text(text: bytes) -> bytes:
+    return struct.pack("<I", len(text)) + text
+
+
+def mcap_channel(number: int, told: bytes) -> bytes:
+    metadata = mcap_text(mcap_text(b"offered_qos_profiles") + mcap_text(told))
+    return mcap_record(4, struct.pack("<HH", number, 0) + mcap_text(b"/a") + mcap_text(b"cdr") + metadata)
+
+
+def test_what_channels_tell_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_chunks, "MOST_TOPIC_BYTES", 1000)
+    path = tmp_path / "flight.mcap"
+    # What is repeated in each chunk counts once.
+    chunk = mcap_channel(1, b"x" * 400) + mcap_channel(2, b"x" * 400)
+    packed = chunk_of_mcap(b"zstd", len(chunk), zstd.compress(chunk))
+    path.write_bytes(packed + packed[8:])
+    check_bag(path)
+    path.write_bytes(packed + mcap_channel(3, b"x" * 400))
+    with pytest.raises(ValueError, match=r"tells \d+ bytes of its topics, at most 1000 are read"):
+        check_bag(path)
+
+
+def test_chunks_hold_nothing_else_and_expand_to_a_bounded_total(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, message = tmp_path / "flight.mcap", mcap_record(5, bytes(10_000))
+    packed = chunk_of_mcap(b"zstd", len(message), zstd.compress(message))
+    monkeypatch.setattr(bag_chunks, "MOST_CHUNK_BYTES", len(message))
+    monkeypatch.setattr(bag_chunks, "MOST_EXPANSION", 0)
+    path.write_bytes(packed)
+    check_bag(path)
+    path.write_bytes(packed + packed[8:])
+    with pytest.raises(ValueError, match="its chunks expand to more than 10009 bytes"):
+        check_bag(path)
+    zeros = bytes(9000)
+    path.write_bytes(chunk_of_mcap(b"zstd", len(zeros), zstd.compress(zeros)))
+    with pytest.raises(ValueError, match="record of kind 0, which belongs to none"):
+        check_bag(path)
+
+
+def test_a_summary_elsewhere_is_refused(tmp_path: Path) -> None:
+    (path,) = write_bag2(tmp_path / "flight", stereo((1.0,))).glob("*.mcap")
+    data = path.read_bytes()
+    start = len(data) - 37 + 9
+    path.write_bytes(data[:start] + struct.pack("<Q", struct.unpack_from("<Q", data, start)[0] - 1) + data[start + 8 :])
+    with pytest.raises(ValueError, match="its summary is not where it says"):
+        check_bag(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ("alter table topics add column c as (hex(id))", "'topics' is computed, and no table"),
+        ("create view v as select 1", "'v' is computed, and no table"),
+        ("update topics set offered_qos_profiles = hex(zeroblob(600000))", "of its topics, at most 1048576 are read"),
+    ],
+)
+def test_tables_that_compute_or_tell_too_much_are_refused(change: str, fault: str, tmp_path: Path) -> None:
+    bag = write_bag2(tmp_path / "flight", stereo((1.0,)), StoragePlugin.SQLITE3)
+    with closing(sqlite3.connect(bag / "flight.db3")) as database, database:
+        database.execute(change)
+    with pytest.raises(ValueError, match=f"^{bag}: cannot be read as a ROS bag: .*{fault}$"):
+        RosBag(bag)
+
+
+DEFINITIONS = {
+    "hostile": "\n" * 180_000 + "!",
+    "another": "std_msgs/Header header\nuint32 width\nuint32 height\n",
+    "as ROS has it": HUMBLE.generate_msgdef(IMAGE, ros_version=2)[0].replace(
+        "uint32 width", "# columns\nuint32  width"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_definitions_are_compared_and_not_parsed(name: str, tmp_path: Path) -> None:
+    """A library's parser takes time with the square of the empty lines."""
+    bag = write_bag2(tmp_path / "flight", stereo((1.0,)), StoragePlugin.SQLITE3)
+    with closing(sqlite3.connect(bag / "flight.db3")) as database, database:
+        change = "update message_definitions set encoded_message_definition = ? where topic_type = ?"
+        database.execute(change, (DEFINITIONS[name], IMAGE))
+        # That of a message that is not read does not matter.
+        database.execute("insert into message_definitions values (99, 'a/msg/B', 'ros2msg', ?, '')", ("!" * 99,))
+    if name == "as ROS has it":
+        assert RosBag(bag).count == 1
+        return
+    with pytest.raises(ValueError, match=f"ROS bag: /left/image_raw: its definition of {IMAGE} is not that of ROS$"):
+        RosBag(bag)
+
+
+def test_a_hash_of_another_definition_is_refused(tmp_path: Path) -> None:
+    path = write_bag1(tmp_path / "flight.bag", (1.0,))
+    digest = NOETIC.generate_msgdef(IMAGE)[1].encode()
+    path.write_bytes(path.read_bytes().replace(digest, digest[::-1]))
+    with pytest.raises(ValueError, match=f"/left/image_raw: its definition of {IMAGE} is not that of ROS$"):
+        RosBag(path)
+
+
+def test_a_table_of_contents_that_refers_to_itself_is_refused(tmp_path: Path) -> None:
+    bag = write_bag2(tmp_path / "flight", stereo((1.0,)))
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(f"all: &a [1, 2]\nagain: *a\n{text}")
+    with pytest.raises(ValueError, match=r"metadata\.yaml: refers to parts of itself \(\*name\)"):
         RosBag(bag)
 
 

@@ -6,11 +6,15 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
+from geometry.compiled_loops import kept_on_disk
 from nav.numerics import compiled
 
 CALLEE = """
@@ -79,6 +83,48 @@ def test_a_package_that_cannot_be_written_is_cached_at_home_and_else_not_at_all(
     (package / "home").touch()
     assert call(package)[:2] == (3, 0)
     assert call(package)[:2] == (3, 0)
+
+
+def sum_of_roots(numbers: np.ndarray) -> float:
+    total = 0.0
+    for number in numbers:
+        total += np.sqrt(number)
+    return total
+
+
+def hits_in_new_cache() -> int:
+    """How often a fresh copy of the loop, which computes the right sum, came from the cache."""
+    loop: Any = kept_on_disk(sum_of_roots, {"nogil": True})
+    assert loop(np.array([4.0, 9.0])) == 5.0
+    return sum(loop.stats.cache_hits.values())
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda data: b"",
+    "truncated": lambda data: data[: len(data) // 2],
+    "flipped": lambda data: data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 1]) + data[len(data) // 2 + 1 :],
+    "another's": lambda data: b"junk" * 100,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_a_damaged_file_of_the_cache_is_compiled_anew(
+    damage: str, suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    assert [hits_in_new_cache(), hits_in_new_cache()] == [0, 1]
+    (file,) = tmp_path.rglob(f"*{suffix}")
+    file.write_bytes(DAMAGES[damage](file.read_bytes()))
+    assert [hits_in_new_cache(), hits_in_new_cache()] == [0, 1]
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    loop: Any = kept_on_disk(sum_of_roots, {"nogil": True})
+    shutil.rmtree(tmp_path / "cache")
+    (tmp_path / "cache").touch()
+    assert loop(np.array([4.0, 9.0])) == 5.0
 
 
 POSES = """
