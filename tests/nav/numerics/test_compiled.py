@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,75 +15,77 @@ import numba
 import numpy as np
 import pytest
 
+from geometry import compiled_loops
 from geometry.compiled_loops import kept_on_disk
-from nav.numerics import compiled
 
 CALLEE = """
-from nav.numerics.compiled import compiled
+from geometry.compiled_loops import compiled
 
 @compiled
 def increased(number):
     return number + {step}
 """
 CALLER = """
-from nav.numerics.compiled import compiled
-from nav.loops.callee import increased
+from geometry.compiled_loops import compiled
+from looped.callee import increased
 
 @compiled
 def increased_twice(number):
     return increased(increased(number))
 """
-CALL = """
-from nav.loops.caller import increased_twice
-print(increased_twice(1), sum(increased_twice.stats.cache_hits.values()), increased_twice.stats.cache_path)
-"""
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
-    """A package `nav` with the project's own `compiled`, and two modules of which one calls the other."""
-    for name in ("numerics", "loops"):
-        (tmp_path / "nav" / name).mkdir(parents=True)
-        (tmp_path / "nav" / name / "__init__.py").touch()
-    (tmp_path / "nav" / "__init__.py").touch()
-    shutil.copy(compiled.__file__, tmp_path / "nav" / "numerics" / "compiled.py")
-    (tmp_path / "nav" / "loops" / "caller.py").write_text(CALLER, encoding="utf-8")
-    (tmp_path / "nav" / "loops" / "callee.py").write_text(CALLEE.format(step=1), encoding="utf-8")
-    return tmp_path
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package of two modules of which one calls the other; a cache at home would be in a folder of its own."""
+    folder = tmp_path / "looped"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "caller.py").write_text(CALLER, encoding="utf-8")
+    (folder / "callee.py").write_text(CALLEE.format(step=1), encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield folder
+    forget_package()
 
 
-def call(package: Path) -> tuple[int, int, str]:
-    """The caller's result in a new process, its number of cache hits, and its cache folder."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
-    home = str(package / "home")
-    # The other packages are those of this checkout.
-    path = os.pathsep.join([str(package), str(Path(__file__).parents[3])])
-    environment |= {"PYTHONPATH": path, "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", CALL]
-    done = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=True)
-    value, hits, *where = done.stdout.split()
-    return int(value), int(hits), "".join(where)
+def forget_package() -> None:
+    """Let the package be read anew, as by a new process."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "looped"]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    compiled_loops._sources_digest.cache_clear()
+
+
+def call() -> tuple[int, int, str]:
+    """The caller's result with modules just read, its number of cache hits, and its cache folder."""
+    forget_package()
+    loop = importlib.import_module("looped.caller").increased_twice
+    value = loop(1)
+    return value, sum(loop.stats.cache_hits.values()), loop.stats.cache_path
 
 
 def test_a_function_is_compiled_anew_when_one_that_it_calls_has_changed(package: Path) -> None:
-    beside = str(package / "nav" / "loops" / "__pycache__")
-    assert call(package) == (3, 0, beside)
-    assert call(package) == (3, 1, beside)
-    (package / "nav" / "loops" / "callee.py").write_text(CALLEE.format(step=10), encoding="utf-8")
-    assert call(package) == (21, 0, beside)
-    assert call(package) == (21, 1, beside)
+    beside = str(package / "__pycache__")
+    assert call() == (3, 0, beside)
+    assert call() == (3, 1, beside)
+    (package / "callee.py").write_text(CALLEE.format(step=10), encoding="utf-8")
+    assert call() == (21, 0, beside)
+    assert call() == (21, 1, beside)
 
 
 def test_a_package_that_cannot_be_written_is_cached_at_home_and_else_not_at_all(package: Path) -> None:
     # A file where the folder would be: permissions would not keep a superuser out.
-    (package / "nav" / "loops" / "__pycache__").touch()
-    value, hits, where = call(package)
-    assert (value, hits) == (3, 0) and Path(where).is_relative_to(package / "home")
-    assert call(package) == (3, 1, where)
-    shutil.rmtree(package / "home")
-    (package / "home").touch()
-    assert call(package)[:2] == (3, 0)
-    assert call(package)[:2] == (3, 0)
+    (package / "__pycache__").touch()
+    home = package.parent / "home"
+    value, hits, where = call()
+    assert (value, hits) == (3, 0) and Path(where).is_relative_to(home)
+    assert call() == (3, 1, where)
+    shutil.rmtree(home)
+    home.touch()
+    assert call()[:2] == (3, 0)
+    assert call()[:2] == (3, 0)
 
 
 def sum_of_roots(numbers: np.ndarray) -> float:
@@ -148,6 +151,7 @@ print(sum(adjust_frames.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_poses_of_loops_that_are_loaded_equal_those_of_loops_just_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     hits, poses = [], []
