@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
-from nav.detector.network.head import DetectionLoss, detection_loss
+from nav.detector.network.head import DetectionLoss, LossWeights, detection_loss
 from nav.training.augmentation import (
     TILES,
     Boxes,
@@ -43,7 +43,6 @@ from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurve
 from nav.training.training_settings import SizePx, TrainingSettings
 from nav.training.training_state import BEST_FILE, ComputeDevice, TrainingState, save_checkpoint, save_state
 
-_MOSAIC_FRACTION = 0.8  # of the images, in the steps with mosaic
 _WHOLE_FRACTION = 0.25  # of the others: the whole image, as in the detector
 # Scales are relative to that at which the image just fits the network's input.
 _MOSAIC_RANGES = ViewRanges(scale=(0.4, 1.4), rotation_deg=4, flip_fraction=0.5)
@@ -101,7 +100,7 @@ class BatchMaker:
         order = sample_generator(settings.seed, epoch, 0, "order").permutation(self._samples_per_epoch)
         rng = sample_generator(settings.seed, epoch, position, "geometry")
         first = int(order[position])
-        is_mosaic = settings.mosaic_at(step) and rng.random() < _MOSAIC_FRACTION
+        is_mosaic = settings.mosaic_at(step) and rng.random() < settings.mosaic_fraction
         samples = [first, *rng.integers(self._samples_per_epoch, size=TILES - 1)] if is_mosaic else [first]
         # The first of the four may be in any corner.
         samples = [samples[tile] for tile in rng.permutation(len(samples))]
@@ -150,7 +149,7 @@ class BatchMaker:
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
     """The learning rate of a step, counted from 0: a linear warm-up, then half a cosine."""
-    warmup = min(settings.warmup_passes // settings.batch_images, settings.steps // 2)
+    warmup = round(settings.warmup_fraction * settings.steps)
     if step < warmup:
         return settings.learning_rate * (step + 1) / (warmup + 1)
     done = (step - warmup) / max(settings.steps - warmup, 1)
@@ -238,7 +237,9 @@ class Trainer:
         boxes = [torch.from_numpy(own).float().to(self.compute.device) for own in batch.boxes]
         with self.compute.autocast():
             maps = state.network(to_tensor(batch.images, self.compute))
-        loss = detection_loss(maps, boxes)
+        settings = self.settings
+        weights = LossWeights(settings.cells_per_box, settings.focus_power, settings.box_weight)
+        loss = detection_loss(maps, boxes, weights)
         state.optimizer.zero_grad(set_to_none=True)
         loss.total.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(state.network.parameters(), self.settings.gradient_norm)

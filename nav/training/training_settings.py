@@ -28,14 +28,21 @@ class TrainingSettings(FrozenModel):
         variant, attention, fusion: of the network.
         views: `both` puts the two eyes of a pair into one batch, with the same geometric draw; `one` draws single eyes.
         mosaic: combine four images into one, but not in the last `plain_fraction` of the training.
+        mosaic_fraction: of the images, in the steps with mosaic.
         size_px: (height, width) of the network's input.
         final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`.
         image_passes: number of images that pass forwards and backwards through the network in the whole training.
         batch_images: number of images in a step; even for `both` views.
         optimizer, learning_rate, weight_decay: of the optimizer; the learning rate is the peak of the schedule.
-        warmup_passes: number of images over which the learning rate rises from zero; it then falls along a cosine to
+        warmup_fraction: of the training, in which the learning rate rises from zero; it then falls along a cosine to
             `floor_fraction` of its peak.
         ema_decay: per step, of the moving average of the weights, which is evaluated and exported.
+        fusion_start: weights with which ASFF begins: `random`, or the same at every location, which are `equal`, or
+            `own` with most for the level that is fused into.
+        prior_score: of every cell before training.
+        cells_per_box: number of the best aligned cells that are assigned to a box.
+        focus_power: exponent by which cells whose score is nearly right are weighted down; 0 is plain cross entropy.
+        box_weight: of the loss of boxes beside that of scores.
         gradient_norm: longer gradients are clipped to this norm.
         seed: of all random draws.
         precision: `bf16` computes most operations in bfloat16; `auto` does so where the hardware supports it.
@@ -55,18 +62,24 @@ class TrainingSettings(FrozenModel):
     fusion: Literal["asff", "concat"] = "asff"
     views: Literal["one", "both"] = "both"
     mosaic: bool = True
+    mosaic_fraction: float = Field(default=0.8, ge=0, le=1)
     plain_fraction: float = Field(default=0.15, ge=0, le=1)
     size_px: SizePx = (480, 640)
     final_size_px: SizePx | None = None
     final_fraction: float = Field(default=0.5, gt=0, lt=1)
     image_passes: int = Field(default=40_000, ge=1)
     batch_images: int = Field(default=8, ge=2, le=1024)
-    optimizer: Literal["adamw", "sgd"] = "adamw"
+    optimizer: Literal["adamw", "muon", "sgd"] = "adamw"
     learning_rate: float = Field(default=2e-3, gt=0)
     weight_decay: float = Field(default=0.02, ge=0)
-    warmup_passes: int = Field(default=1500, ge=0)
+    warmup_fraction: float = Field(default=0.05, ge=0, le=0.5)
     floor_fraction: float = Field(default=0.01, ge=0, le=1)
     ema_decay: float = Field(default=0.998, ge=0, lt=1)
+    fusion_start: Literal["random", "equal", "own"] = "random"
+    prior_score: float = Field(default=0.01, gt=0, lt=1)
+    cells_per_box: int = Field(default=10, ge=1, le=1000)
+    focus_power: float = Field(default=1.0, ge=0, le=5)
+    box_weight: float = Field(default=2.0, gt=0)
     gradient_norm: float = Field(default=10.0, gt=0)
     seed: int = Field(default=0, ge=0, lt=2**63)
     precision: Literal["auto", "float32", "bf16"] = "auto"

@@ -9,7 +9,7 @@ import math
 import os
 import pickle
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -189,7 +189,10 @@ def new_network(settings: TrainingSettings) -> DetectorNetwork:
     # torch initialises layers from its global generator, whose state is restored afterwards.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        return DetectorNetwork(config)
+        network = DetectorNetwork(config)
+    network.initialize_scores(settings.prior_score)
+    network.initialize_fusion(settings.fusion_start)
+    return network
 
 
 def new_state(network: DetectorNetwork, settings: TrainingSettings, compute: ComputeDevice) -> TrainingState:
@@ -198,11 +201,85 @@ def new_state(network: DetectorNetwork, settings: TrainingSettings, compute: Com
     return TrainingState(network, MovingAverage(network, settings.ema_decay), _new_optimizer(network, settings))
 
 
+# Coefficients of the quintic iteration by Jordan et al.: singular values come near 1 in five steps.
+_NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
+_NEWTON_SCHULZ_STEPS = 5
+_MUON_MOMENTUM = 0.95
+# The root mean square of AdamW's updates, so that both have the same learning rate and weight decay.
+_UPDATE_RMS = 0.2
+
+
+def orthogonalize(matrix: Tensor) -> Tensor:
+    """The matrix with the same singular vectors and singular values near 1, between 0.7 and 1.2.
+
+    Source: Jordan et al. 2024, Muon, https://kellerjordan.github.io/posts/muon, a Newton-Schulz iteration.
+
+    Args:
+        matrix: (M, N), not zero.
+    """
+    is_tall = matrix.shape[0] > matrix.shape[1]
+    x = matrix.T if is_tall else matrix
+    x = x / x.norm().clamp(min=1e-12)
+    first, third, fifth = _NEWTON_SCHULZ
+    for _ in range(_NEWTON_SCHULZ_STEPS):
+        gram = x @ x.T
+        x = first * x + (third * gram + fifth * gram @ gram) @ x
+    return x.T if is_tall else x
+
+
+class Muon(torch.optim.AdamW):
+    """Muon for the matrices of a network, its dense and 1x1 convolutions, and AdamW for everything else.
+
+    Steps of a matrix are orthogonal: as large in directions of small gradients as in those of large ones. They are
+    scaled to the size of AdamW's (Liu et al. 2025, arXiv:2502.16982, section 2.2).
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float, weight_decay: float) -> None:
+        every = list(parameters)
+        matrices = [each for each in every if each.ndim > 1 and min(each.flatten(1).shape) > 1 and each.shape[1] > 1]
+        taken = {id(each) for each in matrices}
+        filters = [each for each in every if each.ndim > 1 and id(each) not in taken]
+        others = [each for each in every if each.ndim <= 1]
+        groups = [
+            {"params": matrices, "weight_decay": weight_decay, "is_orthogonal": True},
+            {"params": filters, "weight_decay": weight_decay, "is_orthogonal": False},
+            {"params": others, "weight_decay": 0.0, "is_orthogonal": False},
+        ]
+        super().__init__(groups, lr=learning_rate)
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Update all parameters; the gradients of matrices are consumed."""
+        for group in self.param_groups:
+            if group["is_orthogonal"]:
+                for weights in group["params"]:
+                    self._step_matrix(weights, group["lr"], group["weight_decay"])
+        super().step(closure)
+
+    def _step_matrix(self, weights: nn.Parameter, rate: float, weight_decay: float) -> None:
+        gradient, weights.grad = weights.grad, None  # AdamW leaves parameters without a gradient alone
+        if gradient is None:
+            return
+        state = self.state[weights]
+        if not state:
+            # AdamW wants a count of steps in every state that it loads.
+            state["step"], state["momentum"] = torch.zeros(()), torch.zeros_like(weights)
+        state["step"] += 1
+        mean = state["momentum"]
+        mean.lerp_(gradient, 1 - _MUON_MOMENTUM)
+        matrix = gradient.lerp(mean, _MUON_MOMENTUM).flatten(1)
+        update = orthogonalize(matrix) * (_UPDATE_RMS * max(matrix.shape) ** 0.5)
+        weights.mul_(1 - rate * weight_decay)
+        weights.sub_(update.reshape(weights.shape), alpha=rate)
+
+
 def _new_optimizer(network: nn.Module, settings: TrainingSettings) -> torch.optim.Optimizer:
     """The optimizer, with weight decay for filters only, not for biases, and offsets and scales of normalisation."""
     filters = [weights for weights in network.parameters() if weights.ndim > 1]
     others = [weights for weights in network.parameters() if weights.ndim <= 1]
     groups = [{"params": filters, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    if settings.optimizer == "muon":
+        return Muon(network.parameters(), settings.learning_rate, settings.weight_decay)
     if settings.optimizer == "sgd":
         return torch.optim.SGD(groups, lr=settings.learning_rate, momentum=0.9, nesterov=True)
     return torch.optim.AdamW(groups, lr=settings.learning_rate)

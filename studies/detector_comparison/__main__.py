@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -50,7 +50,7 @@ from studies.detector_comparison.yolov8 import (
 PEERS = ("yolov8s", "yolov8n")
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
-_FREE_TO_CHANGE = ("ours", "threads", "rounds", "device", "environment")
+_FREE_TO_CHANGE = ("ours", "peers", "threads", "rounds", "device", "environment")
 _EXAMPLES = """Examples:
 
   python -m studies.detector_comparison --corpus data/detector-small --ours out/detector/detector.onnx
@@ -78,6 +78,7 @@ class ComparisonOptions:
         device: on which the peers are trained, as ultralytics names it.
         seed: of the peers' training.
         environment: folder of the peers' virtual environment.
+        peers: which of `PEERS`.
     """
 
     corpus: Path
@@ -91,6 +92,7 @@ class ComparisonOptions:
     device: str
     seed: int
     environment: Path
+    peers: tuple[str, ...] = PEERS
 
     def __post_init__(self) -> None:
         if self.image_passes < 0 or self.batch < 1 or self.threads < 1 or self.rounds < 1:
@@ -126,7 +128,7 @@ def compare_peers(options: ComparisonOptions, out: Path, say: Say) -> dict[str, 
 
 
 def _compare(options: ComparisonOptions, out: Path, ours: Mapping[str, Detector], say: Say) -> dict[str, Any]:
-    networks = {name: _peer_network(options, out, name, say) for name in PEERS}
+    networks = {name: _peer_network(options, out, name, say) for name in options.peers}
     detectors: dict[str, Detector] = {name: YoloDetector(file, options.threads) for name, file in networks.items()}
     detectors |= ours
     networks |= {file.stem: file for file in options.ours}
@@ -311,6 +313,9 @@ def main(
             "--environment", help="Virtual environment of ultralytics, made if missing; OUT/environment by default."
         ),
     ] = None,
+    peer: Annotated[
+        list[Literal["yolov8s", "yolov8n"]] | None, typer.Option("--peer", help="Repeatable; both by default.")
+    ] = None,
 ) -> None:
     """Train YOLOv8s and YOLOv8n from scratch, time them in turns with our detectors, and score all by our benchmark.
 
@@ -329,6 +334,7 @@ def main(
             device="0" if device == "cuda" else device,
             seed=seed,
             environment=environment or out / "environment",
+            peers=tuple(peer or PEERS),
         )
         rows = compare_peers(options, out, print_status)
     except (ValueError, OSError) as error:

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,14 +64,22 @@ class SingleViewDetector(OnnxDetector):
 
 ONE_VIEW = "one-view"
 """Name of the network that is trained on single eyes and timed with a pass for each eye."""
-# Options of `droguekit train` by network. The first is what we ship; then the seed paper's ablations, and one of views.
-CHANGES: dict[str, tuple[str, ...]] = {
-    "eca-asff": (),
-    "se": ("--attention", "se"),
-    "concat": ("--fusion", "concat"),
-    "no-mosaic": ("--no-mosaic",),
-    ONE_VIEW: ("--views", "one"),
+# Settings by network. The first is what we ship; then the seed paper's ablations, and one of views.
+PARTS: dict[str, dict[str, Any]] = {
+    "eca-asff": {},
+    "se": {"attention": "se"},
+    "concat": {"fusion": "concat"},
+    "no-mosaic": {"mosaic": False},
+    ONE_VIEW: {"views": "one"},
 }
+# What droguekit 0.2 trained with, whose 1,500 passes of warm-up were this share of 5,184, and one step of it at a time.
+FORMER: dict[str, Any] = {"warmup_fraction": 0.289}
+# How the network learns: one setting changed at a time, beside what we ship and what was before.
+LEARNING: dict[str, dict[str, Any]] = {
+    "eca-asff": {},
+    "former": FORMER,
+}
+CHANGES = PARTS | LEARNING
 _INTERRUPTED = 130
 _TIMED_PAIRS = 4
 
@@ -86,8 +94,10 @@ class AblationOptions:
         variant: of the network, `l` or `s`.
         image_passes: of each network's training.
         size_px: width and height of its input.
-        threads, seed, device: of training.
+        threads, device: of training.
+        seeds: of training; every network is trained once with each.
         rounds: of timing.
+        networks: names of what is trained, of `CHANGES`.
     """
 
     corpus: Path
@@ -96,13 +106,17 @@ class AblationOptions:
     image_passes: int
     size_px: tuple[int, int]
     threads: int
-    seed: int
+    seeds: tuple[int, ...]
     device: str
     rounds: int
+    networks: tuple[str, ...] = tuple(PARTS)
 
     def __post_init__(self) -> None:
         if self.image_passes < 1:
             raise ValueError(f"--image-passes: must be at least 1, got {self.image_passes}")
+        unknown = [name for name in self.networks if name not in CHANGES]
+        if unknown or not self.networks:
+            raise ValueError(f"--network: must be of {', '.join(CHANGES)}, got {', '.join(unknown) or 'none'}")
 
 
 def ablate(options: AblationOptions, out: Path, say: Callable[[str], None]) -> list[str]:
@@ -121,41 +135,48 @@ def ablate(options: AblationOptions, out: Path, say: Callable[[str], None]) -> l
         OSError: a training failed; the message has the last line of its output.
     """
     read_blind_index(options.test)  # before hours of training
-    for name, changes in CHANGES.items():
-        _train(options, out / name, changes, say)
-    rows = measured_networks(options, {name: out / name / "detector.onnx" for name in CHANGES}, say)
+    folders = {name: [out / name / f"seed-{seed}" for seed in options.seeds] for name in options.networks}
+    # Seed by seed, so that a run that is stopped has compared all networks.
+    for number, seed in enumerate(options.seeds):
+        for name in options.networks:
+            _train(options, folders[name][number], CHANGES[name] | {"seed": seed}, say)
+    files = {name: [folder / "detector.onnx" for folder in each] for name, each in folders.items()}
+    rows = measured_networks(options, files, say)
     write_text_atomic(out / "ablation.json", json.dumps({"schema": 1, "networks": rows}, indent=1) + "\n")
     return ablation_lines(rows)
 
 
 def measured_networks(
-    options: AblationOptions, files: dict[str, Path], say: Callable[[str], None]
+    options: AblationOptions, files: Mapping[str, Sequence[Path]], say: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
     """Scores on the test split by our benchmark, times measured in turns, and cost of networks.
 
     Args:
         options: of the ablations.
-        files: by name; the one of `ONE_VIEW` is run with a pass for each eye.
+        files: by name, one for each seed; those of `ONE_VIEW` are run with a pass for each eye. The first is timed.
         say: receives lines about the progress.
 
     Raises:
         ValueError: a network or the test dataset cannot be read.
     """
-    detectors: dict[str, Detector] = {
-        name: (SingleViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, options.threads, options.size_px)
-        for name, file in files.items()
+    detectors: dict[str, list[Detector]] = {
+        name: [
+            (SingleViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, options.threads, options.size_px)
+            for file in each
+        ]
+        for name, each in files.items()
     }
     source = BlindDataset(options.test)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     say("timing in turns")
-    latencies = measure_latency(detectors, pairs, options.rounds)
+    latencies = measure_latency({name: first for name, (first, *_) in detectors.items()}, pairs, options.rounds)
     say("detecting the drogue in the test split")
     images = [image for image in read_detection_truth(options.test).images if image.split == "test"]
     return {
-        name: {"test": _test_precision(options.test, detector, images)}
+        name: {"test": [_test_precision(options.test, detector, images) for detector in each]}
         | latencies[name]._asdict()
-        | network_cost(files[name], options.size_px)._asdict()
-        for name, detector in detectors.items()
+        | network_cost(files[name][0], options.size_px)._asdict()
+        for name, each in detectors.items()
     }
 
 
@@ -169,40 +190,53 @@ def _test_precision(dataset: Path, detector: Detector, images: Sequence[ImageTru
 
 
 def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
-    """A table with one line per network: cost, scores on the test split, and times."""
+    """A table with one line per network: cost, means of the scores on the test split, times, and AP by seed."""
     lines = [
-        f"{'network':<12} {'parameters':>11} {'GFLOPs':>7} {'AP50':>8} {'AP':>8} {'wall [ms]':>10} {'CPU [ms]':>9}"
+        f"{'network':<15} {'parameters':>11} {'GFLOPs':>7} {'AP50':>8} {'AP':>8} {'wall [ms]':>10} {'CPU [ms]':>9}  "
+        "AP by seed"
     ]
     for name, row in rows.items():
-        test = row["test"]
-        ap50, ap = (percent_text(None if test is None else test[key]) for key in ("ap50", "ap"))
+        ap50s, aps = ([None if test is None else test[key] for test in row["test"]] for key in ("ap50", "ap"))
         lines.append(
-            f"{name:<12} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {ap50:>8} {ap:>8} "
-            f"{row['wall_ms'][0]:10.1f} {row['cpu_ms'][0]:9.1f}"
+            f"{name:<15} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {percent_text(_mean(ap50s)):>8} "
+            f"{percent_text(_mean(aps)):>8} {row['wall_ms'][0]:10.1f} {row['cpu_ms'][0]:9.1f}  "
+            f"{', '.join(map(percent_text, aps))}"
         )
     return lines
 
 
-def _train(options: AblationOptions, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None if any is."""
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if values and len(numbers) == len(values) else None
+
+
+def settings_text(changes: Mapping[str, Any]) -> str:
+    """Settings as TOML, whose texts, numbers and truth values are those of JSON."""
+    return "".join(f"{key} = {json.dumps(value)}\n" for key, value in changes.items())
+
+
+def _train(options: AblationOptions, folder: Path, changes: Mapping[str, Any], say: Callable[[str], None]) -> None:
     """Start a training, or resume it, unless it is complete."""
     width, height = options.size_px
     arguments = {
         "--out": folder,
-        "--cache": folder.parent / "cache",
+        "--cache": folder.parents[1] / "cache",
+        "--settings": folder / "ablation.toml",
         "--variant": options.variant,
         "--image-passes": options.image_passes,
         "--size": f"{height}x{width}",
-        "--seed": options.seed,
         "--device": options.device,
         "--threads": options.threads,
     }
-    say(f"{folder.name}: training, unless it is complete; {folder / 'train.log'}")
+    say(f"{folder.parent.name}, {folder.name}: training, unless it is complete; {folder / 'train.log'}")
     folder.mkdir(parents=True, exist_ok=True)
+    write_text_atomic(folder / "ablation.toml", settings_text(changes))
     words = [str(word) for argument in arguments.items() for word in argument]
     with (folder / "train.log").open("a", encoding="utf-8") as log:
         ended = subprocess.run(
             # -P: a file in the working folder must not replace a module of ours.
-            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(options.corpus), *words, *changes],
+            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(options.corpus), *words],
             stdout=log,
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -218,7 +252,8 @@ def _train(options: AblationOptions, folder: Path, changes: tuple[str, ...], say
 _EXAMPLES = """Examples:
 
   python -m studies.detector_comparison.ablation --corpus data/detector-small --image-passes 5000
-  python -m studies.detector_comparison.ablation --corpus data/detector-train --test data/detector-test"""
+  python -m studies.detector_comparison.ablation --corpus data/detector-train --test data/detector-test
+  python -m studies.detector_comparison.ablation --corpus data/detector-small --learning --seeds 3"""
 
 
 def main(
@@ -232,13 +267,27 @@ def main(
     size: SizeOption = "320x416",
     threads: ThreadsOption = 2,
     seed: SeedOption = 0,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of trainings of each, from --seed on.")] = 1,
+    network: Annotated[
+        list[str] | None, typer.Option("--network", metavar="NAME", help="One of those below. Repeatable.")
+    ] = None,
+    learning: Annotated[bool, typer.Option("--learning", help="How our network learns, not what it is.")] = False,
     device: DeviceOption = "cpu",
     rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 30,
 ) -> None:
     """Train variants of our network that differ in one thing, for the same image passes; measure scores and times."""
     try:
         options = AblationOptions(
-            corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
+            corpus,
+            test or corpus,
+            variant,
+            image_passes,
+            input_size_px(size),
+            threads,
+            tuple(range(seed, seed + seeds)),
+            device,
+            rounds,
+            tuple(network or (LEARNING if learning else PARTS)),
         )
         lines = ablate(options, out, print_status)
     except (ValueError, OSError) as error:

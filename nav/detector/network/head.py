@@ -11,6 +11,7 @@ arXiv:1911.08287, eq. 10).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import log, pi
 from typing import NamedTuple
 
@@ -49,6 +50,11 @@ class DetectionHead(nn.Module):
             assert layer.bias is not None
             nn.init.normal_(layer.weight, std=_PREDICTION_SD)
             nn.init.constant_(layer.bias, bias)
+
+    def initialize_score(self, prior: float) -> None:
+        """Set the bias of the score so that all cells predict nearly this score."""
+        assert self.score.bias is not None
+        nn.init.constant_(self.score.bias, log(prior / (1 - prior)))
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C, H, W) -> (B, 5, H, W), see `nav.detector.output_maps`; always float32, also in autocast."""
@@ -107,16 +113,26 @@ def decode_boxes(log_distances: Tensor, anchors: AnchorPoints) -> Tensor:
     return torch.cat((low_px, anchors.centers_px + distances_px[..., 2:]), dim=-1)
 
 
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the loss, and the size of the assignment.
+
+    Attributes:
+        cells_per_box: number of the best aligned cells that are assigned to a box.
+        focus_power: exponent by which cells whose score is nearly right are weighted down (quality focal loss,
+            arXiv:2006.04388, eq. 3, where it is 2); 0 is plain cross entropy.
+        box_weight: of the boxes' loss beside the scores'.
+    """
+
+    cells_per_box: int = 10
+    focus_power: float = 1.0
+    box_weight: float = 2.0
+
+
 _MIN_AREA_PX2 = 1e-6  # keeps quotients finite where a box is empty
-# The alignment of a cell with a box is score^a IoU^b; this many of the best aligned cells are assigned to the box.
+# The alignment of a cell with a box is score^a IoU^b; the best aligned cells are assigned to the box.
 _SCORE_POWER, _IOU_POWER = 0.5, 6.0
-_CELLS_PER_BOX = 10
 _TINY = 1e-12
-# Exponent by which cells whose score is nearly right are weighted down (quality focal loss, arXiv:2006.04388, eq. 3).
-# The paper has 2, with which scores rose later in short trainings on few images; 0 is plain cross entropy, in which the
-# few cells of a box have little weight beside the many others. Long trainings were not compared.
-_FOCUS_POWER = 1.0
-_BOX_WEIGHT = 2.0
 
 
 def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
@@ -175,7 +191,12 @@ class Assignment(NamedTuple):
 
 @torch.no_grad()
 def assign_anchors(
-    scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, is_box: Tensor
+    scores: Tensor,
+    boxes_px: Tensor,
+    centers_px: Tensor,
+    truth_px: Tensor,
+    is_box: Tensor,
+    cells_per_box: int = LossWeights.cells_per_box,
 ) -> Assignment:
     """Assign cells to every true box (task-aligned assignment).
 
@@ -190,11 +211,12 @@ def assign_anchors(
         centers_px: (N, 2) centres of the cells, finer maps first.
         truth_px: (B, M, 4) true boxes: left, top, right, bottom; M at least 1.
         is_box: (B, M) bool: false for rows of `truth_px` that are padding.
+        cells_per_box: largest number of cells of a box.
     """
     is_candidate = _candidate_cells(centers_px, truth_px) & is_box[:, :, None]
     iou = intersection_over_union(truth_px[:, :, None], boxes_px[:, None])
     alignment = (scores[:, None].pow(_SCORE_POWER) * iou.pow(_IOU_POWER)).clamp(min=_TINY) * is_candidate
-    best = alignment.topk(min(_CELLS_PER_BOX, alignment.shape[2]), dim=2).indices
+    best = alignment.topk(min(cells_per_box, alignment.shape[2]), dim=2).indices
     assigned = torch.zeros_like(is_candidate).scatter_(2, best, True) & is_candidate
     box_index = torch.where(assigned, iou, -1.0).argmax(dim=1)
     assigned &= functional.one_hot(box_index, assigned.shape[1]).transpose(1, 2).bool()
@@ -229,12 +251,15 @@ class DetectionLoss(NamedTuple):
     box: Tensor
 
 
-def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> DetectionLoss:
+def detection_loss(
+    maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor], weights: LossWeights = LossWeights()
+) -> DetectionLoss:
     """Loss of a batch, computed in float32 whatever the dtype of the maps.
 
     Args:
         maps: the network's output, three times (B, 5, H, W).
         boxes_xywh_px: for each image (n, 4) true boxes in corner coordinates of the input; n may be 0.
+        weights: of the loss and the assignment.
 
     Raises:
         ValueError: another number of box arrays than images, or boxes that are not (n, 4).
@@ -250,13 +275,15 @@ def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> D
         cells = flatten_maps(maps)
         logits, predicted_px = cells[..., 0], decode_boxes(cells[..., 1:], anchors)
         truth_px, is_box = _pad_boxes(boxes_xywh_px, device)
-        targets = assign_anchors(logits.sigmoid(), predicted_px, anchors.centers_px, truth_px, is_box)
+        targets = assign_anchors(
+            logits.sigmoid(), predicted_px, anchors.centers_px, truth_px, is_box, weights.cells_per_box
+        )
         normalizer = targets.scores.sum().clamp(min=1.0)
-        score = _quality_focal_loss(logits, targets.scores).sum() / normalizer
+        score = _quality_focal_loss(logits, targets.scores, weights.focus_power).sum() / normalizer
         target_px = truth_px.gather(1, targets.box_index[..., None].expand(-1, -1, 4))
         on = targets.foreground
         box = ((1 - complete_iou(predicted_px[on], target_px[on])) * targets.scores[on]).sum() / normalizer
-    return DetectionLoss(score + _BOX_WEIGHT * box, score, box)
+    return DetectionLoss(score + weights.box_weight * box, score, box)
 
 
 def _pad_boxes(boxes_xywh_px: Sequence[Tensor], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -269,7 +296,7 @@ def _pad_boxes(boxes_xywh_px: Sequence[Tensor], device: torch.device) -> tuple[T
     return torch.cat((xywh[..., :2], xywh[..., :2] + xywh[..., 2:]), dim=-1), is_box
 
 
-def _quality_focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
+def _quality_focal_loss(logits: Tensor, targets: Tensor, focus_power: float) -> Tensor:
     """Cross entropy with targets between 0 and 1, weighted by the distance of the score from its target."""
-    distance = (targets - logits.sigmoid()).abs().pow(_FOCUS_POWER)
+    distance = (targets - logits.sigmoid()).abs().pow(focus_power)
     return distance * functional.binary_cross_entropy_with_logits(logits, targets, reduction="none")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from math import log
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -18,9 +19,11 @@ from nav.detector.network.head import DetectionHead
 from nav.detector.output_maps import STRIDES
 
 Fusion = Literal["asff", "concat"]
+FusionStart = Literal["random", "equal", "own"]
 
 # Number of channels from which the fusion weights of a level are computed (8 or 16 in the ASFF reference code).
 _WEIGHT_CHANNELS = 8
+_OWN_WEIGHT = 0.8  # of a level in its own fusion, where fusion starts with it
 
 
 class LevelResize(nn.Module):
@@ -50,6 +53,17 @@ class AdaptiveFusion(nn.Module):
         self.compress = nn.ModuleList(pointwise(channels, _WEIGHT_CHANNELS) for _ in STRIDES)
         self.weigh = nn.Conv2d(_WEIGHT_CHANNELS * len(STRIDES), len(STRIDES), 1)
         self.expand = separable(channels)
+
+    def initialize(self, start: FusionStart, level: int) -> None:
+        """Set the weights of the three levels to the same at every location, `_OWN_WEIGHT` or a third for `level`."""
+        if start == "random":
+            return
+        assert self.weigh.bias is not None
+        nn.init.zeros_(self.weigh.weight)
+        nn.init.zeros_(self.weigh.bias)
+        if start == "own":
+            with torch.no_grad():
+                self.weigh.bias[level] = log(_OWN_WEIGHT / ((1 - _OWN_WEIGHT) / (len(STRIDES) - 1)))
 
     def level_weights(self, levels: Sequence[Tensor]) -> Tensor:
         """(B, 3, H, W) weight of each level at each location; the weights sum to one."""
@@ -176,6 +190,18 @@ class DetectorNetwork(nn.Module):
         for head in self.heads:
             assert isinstance(head, DetectionHead)
             head.initialize_priors()
+
+    def initialize_scores(self, prior: float) -> None:
+        """Let every cell predict nearly this score."""
+        for head in self.heads:
+            assert isinstance(head, DetectionHead)
+            head.initialize_score(prior)
+
+    def initialize_fusion(self, start: FusionStart) -> None:
+        """Let ASFF begin with these weights; other fusions are left as they are."""
+        for level, fusion in enumerate(self.neck.fuse):
+            if isinstance(fusion, AdaptiveFusion):
+                fusion.initialize(start, level)
 
     def fold_gain(self) -> None:
         """Fold the gain into the first layer's weights: the same outputs with one multiplication of the image less."""

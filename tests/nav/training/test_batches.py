@@ -74,3 +74,13 @@ def test_the_last_part_is_larger_and_without_mosaic(ellipse_corpus: Corpus) -> N
     # One image has at most one drogue.
     assert max(len(boxes) for step in range(24, 30) for boxes in maker.batch(step).boxes) == 1
     assert max(len(boxes) for step in range(6) for boxes in maker.batch(step).boxes) > 1
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 1.0])
+def test_the_share_of_mosaics_is_that_of_the_settings(ellipse_corpus: Corpus, fraction: float) -> None:
+    changes = {"size_px": (96, 128), "batch_images": 4, "image_passes": 240, "plain_fraction": 0.0}
+    maker = BatchMaker(ellipse_corpus, build_settings(None, {**changes, "mosaic_fraction": fraction}))
+    # The eyes of a pair share the draw. Four drogues in a mosaic, unless some are cut off; at most one in other images.
+    mosaics = [max(map(len, maker.batch(step).boxes[left : left + 2])) > 1 for step in range(60) for left in (0, 2)]
+    # Four standard deviations of 120 draws.
+    assert abs(sum(mosaics) / len(mosaics) - fraction) <= 4 * (fraction * (1 - fraction) / len(mosaics)) ** 0.5

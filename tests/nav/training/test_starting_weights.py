@@ -104,7 +104,7 @@ SMALL = {
     "size_px": (96, 128),
     "batch_images": 4,
     "image_passes": 4,
-    "warmup_passes": 8,
+    "warmup_fraction": 0.1,
     "precision": "float32",
     "threads": 1,
 }

@@ -43,7 +43,7 @@ SMALL = {
     "variant": "s",
     "size_px": (96, 128),
     "batch_images": 4,
-    "warmup_passes": 8,
+    "warmup_fraction": 0.1,
     "precision": "float32",
     "threads": 1,
 }
@@ -240,7 +240,7 @@ def test_a_folder_in_use_is_refused(split_dataset: Path, tmp_path: Path) -> None
 
 
 # 350 steps, without images put together: a network that is to know 80 images needs no others.
-TOY = {"image_passes": 1400, "warmup_passes": 160, "learning_rate": 0.005, "mosaic": False, "ema_decay": 0.97}
+TOY = {"image_passes": 1400, "warmup_fraction": 0.1143, "learning_rate": 0.005, "mosaic": False, "ema_decay": 0.97}
 
 
 @pytest.mark.slow

@@ -11,7 +11,20 @@ import pytest
 import torch
 
 from nav.training.training_settings import TrainingSettings
-from nav.training.training_state import MovingAverage, load_checkpoint, new_network, save_checkpoint
+from nav.training.training_state import (
+    CHECKPOINT_FILE,
+    ComputeDevice,
+    MovingAverage,
+    Muon,
+    TrainingState,
+    load_checkpoint,
+    new_network,
+    new_state,
+    orthogonalize,
+    restore_state,
+    save_checkpoint,
+    save_state,
+)
 
 
 def test_the_moving_average_takes_in_weights_and_running_means() -> None:
@@ -78,3 +91,79 @@ def test_a_compressed_checkpoint_is_refused(tmp_path: Path) -> None:
             packed.writestr(name, stored.read(name))
     with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or not a checkpoint"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize("shape", [(12, 40), (40, 12), (16, 16)])
+def test_orthogonalisation_keeps_singular_vectors_and_levels_singular_values(shape: tuple[int, int]) -> None:
+    matrix = torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    u, values, vt = torch.linalg.svd(matrix, full_matrices=False)
+    matrix = u @ torch.diag(torch.logspace(0, -1.5, len(values), dtype=torch.float64)) @ vt
+    turned = u.T @ orthogonalize(matrix) @ vt.T
+    levelled = turned.diagonal()
+    # The polynomials of Jordan et al. are tuned for speed, not for 1: they end between 0.68 and 1.14.
+    assert float(levelled.min()) > 0.65 and float(levelled.max()) < 1.2
+    torch.testing.assert_close(turned, torch.diag(levelled), rtol=0, atol=1e-9)
+    torch.testing.assert_close(orthogonalize(7 * matrix), orthogonalize(matrix), rtol=1e-9, atol=1e-9)
+
+
+def test_muon_steps_matrices_by_their_orthogonal_part_and_all_else_as_adamw() -> None:
+    generator = torch.Generator().manual_seed(2)
+    shapes = {"dense": (8, 4, 3, 3), "depthwise": (8, 1, 3, 3), "attention": (1, 1, 5), "scale": (8,)}
+    ours, theirs = (
+        {name: torch.nn.Parameter(torch.ones(shape)) for name, shape in shapes.items()} for _ in ("muon", "adamw")
+    )
+    gradients = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    muon = Muon(ours.values(), learning_rate=0.1, weight_decay=0.02)
+    filters, others = [theirs["depthwise"], theirs["attention"]], [theirs["scale"]]
+    groups = [{"params": filters, "weight_decay": 0.02}, {"params": others, "weight_decay": 0.0}]
+    adamw = torch.optim.AdamW(groups, lr=0.1)
+    for parameters in (ours, theirs):
+        for name, value in parameters.items():
+            value.grad = gradients[name].clone()
+    muon.step()
+    adamw.step()
+    for name in ("depthwise", "attention", "scale"):
+        torch.testing.assert_close(ours[name], theirs[name])
+    step = (1 - 0.1 * 0.02 - ours["dense"]).detach().flatten(1)
+    # 0.2 sqrt(max(M, N)) times singular values near 1.
+    sizes = torch.linalg.svdvals(step) / (0.1 * 0.2 * 36**0.5)
+    assert float(sizes.min()) > 0.6 and float(sizes.max()) < 1.2
+    # Both turn by the gradient: their product is symmetric and positive.
+    product = step @ gradients["dense"].flatten(1).T
+    torch.testing.assert_close(product, product.T, rtol=0, atol=1e-4)
+    assert bool((torch.linalg.eigvalsh((product + product.T) / 2) > 0).all())
+
+
+def test_a_training_with_muon_resumes_exactly(tmp_path: Path) -> None:
+    settings = TrainingSettings(variant="s", optimizer="muon")
+    compute = ComputeDevice(torch.device("cpu"), bf16=False)
+
+    def step(state: TrainingState) -> None:
+        for number, weights in enumerate(state.network.parameters()):
+            weights.grad = torch.sin(weights.detach() + number + state.step)
+        state.optimizer.step()
+        state.step += 1
+
+    whole = new_state(new_network(settings), settings, compute)
+    step(whole)
+    save_state(tmp_path, whole, settings, [])
+    resumed = new_state(new_network(settings), settings, compute)
+    assert restore_state(tmp_path, resumed, settings, [])
+    for state in (whole, resumed):
+        step(state)
+    for one, other in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_checkpoint_from_before_the_warm_up_was_a_share_is_refused_in_one_line(tmp_path: Path) -> None:
+    settings = TrainingSettings(variant="s")
+    state = new_state(new_network(settings), settings, ComputeDevice(torch.device("cpu"), bf16=False))
+    save_state(tmp_path, state, settings, [])
+    content = load_checkpoint(tmp_path / CHECKPOINT_FILE)
+    assert content is not None
+    del content["settings"]["warmup_fraction"]
+    content["settings"]["warmup_passes"] = 1500
+    save_checkpoint(tmp_path / CHECKPOINT_FILE, content)
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: belongs to .* warmup_passes, warmup_fraction;") as caught:
+        restore_state(tmp_path, state, settings, [])
+    assert "\n" not in str(caught.value)

@@ -24,6 +24,7 @@ from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRun
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.detector.onnx_detector import OnnxDetector
+from nav.training.training_settings import build_settings
 from studies.detector_comparison.__main__ import (
     PEERS,
     ComparisonOptions,
@@ -38,6 +39,7 @@ from studies.detector_comparison.ablation import (
     ablate,
     ablation_lines,
     measured_networks,
+    settings_text,
 )
 from studies.detector_comparison.options import input_size_px
 from studies.detector_comparison.yolov8 import (
@@ -267,15 +269,16 @@ def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes
 ) -> None:
     file = write_maps_network(tmp_path / "detector.onnx")
     nowhere = tmp_path / "nowhere"
-    ablation = AblationOptions(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
-    rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
+    ablation = AblationOptions(nowhere, screen_dataset, "s", 1, (64, 64), 1, (0, 1), "cpu", 2)
+    rows = measured_networks(ablation, {"eca-asff": [file, file], ONE_VIEW: [file]}, lambda line: None)
     truth = read_detection_truth(screen_dataset)
     boxes = list(DetectorRunner(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
     overall = score_detections(truth, {"mine": DetectorOutput(boxes)}, "test").result.detectors["mine"].overall
     assert {box.image_id for box in boxes} > {image.image_id for image in truth.images if image.split == "test"}
-    for row in rows.values():
+    for row, seeds in zip(rows.values(), (2, 1), strict=True):
         # The same numbers from batches of other sizes.
-        assert row["test"] == pytest.approx({key: getattr(overall, key) for key in ("ap", "ap50", "ap75")}, abs=1e-6)
+        scores = pytest.approx({key: getattr(overall, key) for key in ("ap", "ap50", "ap75")}, abs=1e-6)
+        assert row["test"] == [scores] * seeds
         assert row["ratio"] > 0 and row["parameters"] > 0
     images = Dataset(screen_dataset).images(0)
     one, both = (kind(file).candidates(images, 0.0) for kind in (SingleViewDetector, OnnxDetector))
@@ -321,14 +324,27 @@ def test_tables_have_a_line_for_each_network() -> None:
     }
     lines = list(comparison_lines({"a": row | {"ratio": 1.0}, "b": row | {"ratio": 0.4, "ap50": 0.9876, "ap": 0.8}}))
     assert len(lines) == 4 and "CPU / a" in lines[0] and "98.76 %" in lines[2] and "3,011,043" in lines[1]
-    ablation = ablation_lines({name: row | {"test": None} for name in CHANGES})
-    assert len(ablation) == 1 + len(CHANGES)
+    tests = [{"ap50": 0.75, "ap": 0.25}, {"ap50": 0.5, "ap": 0.5}]
+    ablation = ablation_lines({name: row | {"test": [None]} for name in CHANGES} | {"two seeds": row | {"test": tests}})
+    assert len(ablation) == 2 + len(CHANGES)
+    assert "62.50 %" in ablation[-1] and "37.50 %" in ablation[-1] and ablation[-1].endswith("25.00 %, 50.00 %")
     with pytest.raises(ValueError, match="--image-passes: must be at least 1, got 0"):
-        AblationOptions(Path(), Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
+        AblationOptions(Path(), Path(), "s", 0, (64, 64), 1, (0,), "cpu", 1)
+    with pytest.raises(ValueError, match=r"--network: must be of eca-asff, .* got none, fpn"):
+        AblationOptions(Path(), Path(), "s", 8, (64, 64), 1, (0,), "cpu", 1, ("se", "none", "fpn"))
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_network_of_the_ablation_can_be_trained_and_differs_from_what_ships(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "ablation.toml"
+    file.write_text(settings_text(CHANGES[name]))
+    settings = build_settings(file, {})
+    assert {key: getattr(settings, key) for key in CHANGES[name]} == CHANGES[name]
+    assert (settings == build_settings(None, {})) == (name == next(iter(CHANGES)))
 
 
 def test_a_test_that_is_not_there_is_found_before_training(screen_dataset: Path, tmp_path: Path) -> None:
-    ablation = AblationOptions(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, 0, "cpu", 1)
+    ablation = AblationOptions(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, (0,), "cpu", 1)
     with pytest.raises(ValueError, match="nowhere"):
         ablate(ablation, tmp_path / "out", lambda line: None)
     assert not (tmp_path / "out").exists()

@@ -109,3 +109,15 @@ def test_a_cell_in_two_boxes_is_assigned_to_the_one_with_the_higher_iou() -> Non
     shared = both & (CELLS.centers_px > 20).all(dim=1) & (CELLS.centers_px < 80).all(dim=1)
     taken = assigned.box_index[0][shared & (assigned.scores[0] > 0.5)]
     assert len(taken) and bool((taken == 1).all())
+
+
+@pytest.mark.parametrize("cells", [1, 3, 25])
+def test_a_box_gets_its_best_aligned_cells(cells: int) -> None:
+    scores, boxes = random_predictions(5)
+    truth = corners([(5.0, 9.0, 110.0, 100.0)])
+    present = torch.ones(1, 1, dtype=torch.bool)
+    assigned = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], present, cells)
+    inside = ((CELLS.centers_px > truth[0, :2]) & (CELLS.centers_px < truth[0, 2:])).all(dim=1)
+    alignment = scores[0].sqrt() * intersection_over_union(boxes[0], truth).pow(6) * inside
+    best = set(alignment.argsort(descending=True)[:cells].tolist())
+    assert set(torch.nonzero(assigned.foreground[0])[:, 0].tolist()) == best

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from math import exp, log
+
 import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.network.head import detection_loss
+from nav.detector.network.head import LossWeights, detection_loss
 from nav.detector.network.network import NetworkConfig
 from nav.detector.output_maps import STRIDES, decode_maps
 from tests.support.detector_networks import make_network
@@ -116,3 +118,19 @@ def test_extreme_predictions_keep_the_loss_finite() -> None:
 def test_boxes_that_fit_no_batch_are_refused(boxes: list[torch.Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=f"boxes_xywh_px: .*{message}"):
         detection_loss(blank_maps(2), boxes)
+
+
+def test_the_weights_of_the_loss_in_closed_form() -> None:
+    logit = -1.0
+    maps = blank_maps(2, logit)
+    plain = detection_loss(maps, BOXES, LossWeights(focus_power=0.0, box_weight=3.0))
+    focused = detection_loss(maps, BOXES, LossWeights(focus_power=2.0, box_weight=7.0))
+    assert plain.total.item() == pytest.approx(plain.score.item() + 3 * plain.box.item(), rel=1e-6)
+    assert focused.total.item() == pytest.approx(focused.score.item() + 7 * focused.box.item(), rel=1e-6)
+    assert plain.box.item() == focused.box.item()
+    # Without boxes all targets are 0 and the divisor is 1: a cell's cross entropy is log(1 + e^x), its score s(x).
+    cells = sum(HEIGHT // stride * (WIDTH // stride) for stride in STRIDES)
+    score = 1 / (1 + exp(-logit))
+    for power in (0.0, 1.0, 2.0):
+        loss = detection_loss(blank_maps(1, logit), [NONE], LossWeights(focus_power=power))
+        assert loss.score.item() == pytest.approx(cells * score**power * log(1 + exp(logit)), rel=1e-5)

@@ -20,7 +20,14 @@ from nav.detector.network.backbone import (
     eca_kernel_size,
     squeezed_channels,
 )
-from nav.detector.network.network import AdaptiveFusion, DetectorNetwork, LevelResize, NetworkConfig, complexity
+from nav.detector.network.network import (
+    AdaptiveFusion,
+    DetectorNetwork,
+    FusionStart,
+    LevelResize,
+    NetworkConfig,
+    complexity,
+)
 from nav.detector.output_maps import STRIDES
 from tests.support.detector_networks import make_network
 
@@ -228,3 +235,32 @@ def test_the_gain_of_images_can_be_folded_into_the_first_layer() -> None:
     for one, other in zip(before, after, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
     assert folded.gain == 1
+
+
+@pytest.mark.parametrize(("start", "own", "other"), [("equal", 1 / 3, 1 / 3), ("own", 0.8, 0.1)])
+def test_fusion_starts_with_the_same_weights_everywhere(start: FusionStart, own: float, other: float) -> None:
+    network = make_network(NetworkConfig("s"))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    network.initialize_fusion(start)
+    generator = torch.Generator().manual_seed(9)
+    for level, fusion in enumerate(network.neck.fuse):
+        assert isinstance(fusion, AdaptiveFusion)
+        channels = network.heads[level].score.in_channels
+        levels = [3 * torch.randn(1, channels, 4, 6, generator=generator) for _ in STRIDES]
+        wanted = torch.full((1, 3, 4, 6), other)
+        wanted[:, level] = own
+        torch.testing.assert_close(fusion.level_weights(levels), wanted, rtol=0, atol=1e-6)
+    changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed and all("weigh" in name for name in changed)
+
+
+def test_networks_start_with_the_score_that_they_are_given() -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(6)
+        network = DetectorNetwork(NetworkConfig("s")).train()
+    network.initialize_scores(0.2)
+    with torch.no_grad():
+        maps = network(torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(6)))
+    # Weights of 0.01 on 64 normalised features move the logit by about 0.1, at most by some standard deviations.
+    for each in maps:
+        assert float((each[:, 0].sigmoid() - 0.2).abs().max()) < 0.1
