@@ -224,7 +224,8 @@ def orthogonalize(matrix: Tensor) -> Tensor:
     for _ in range(_NEWTON_SCHULZ_STEPS):
         gram = x @ x.T
         x = first * x + (third * gram + fifth * gram @ gram) @ x
-    return x.T if is_tall else x
+    orthogonal: Tensor = x.T if is_tall else x
+    return orthogonal
 
 
 class Muon(torch.optim.AdamW):
