@@ -6,8 +6,10 @@ import importlib.util
 import io
 import os
 import re
+import resource
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -57,6 +59,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.mitsuba)
         if missing and item.get_closest_marker("mitsuba") is not None:
             item.add_marker(pytest.mark.skip(reason="mitsuba is missing: pip install 'droguekit[mitsuba]'"))
+
+
+@pytest.fixture
+def full_disk() -> Callable[[int], AbstractContextManager[None]]:
+    """Within `full_disk(most_bytes)` no file may grow beyond so many bytes, and the system says so as on a full disk.
+
+    It holds for this process and those that it starts.
+    """
+
+    @contextmanager
+    def limited(most_bytes: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

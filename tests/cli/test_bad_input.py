@@ -6,12 +6,11 @@ import io
 import json
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import AbstractContextManager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -24,12 +23,9 @@ from tests.support.recipe_builder import between, recipe_text
 RECIPE = recipe_text(name="mine", frames={"count": 2}, distance=between(3.0, 9.0), render={"samples_per_px": 1})
 
 
-def _run(*arguments: str | Path, before: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
-    """The command as a user sees it, in this process unless something has to be done to its process before."""
+def _run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The command as a user sees it, in this process."""
     words = [str(argument) for argument in arguments]
-    if before is not None:
-        command = [sys.executable, "-m", "droguekit.cli.main", *words]
-        return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before)
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = run(words)
@@ -124,16 +120,19 @@ def test_an_unwritable_folder(tmp_path: Path) -> None:
         pytest.param("mitsuba", 20_000, r"cannot be .*File too large", marks=pytest.mark.mitsuba),
     ],
 )
-def test_a_full_disk_leaves_nothing_half_written(engine: str, most_bytes: int, message: str, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_nothing_half_written(
+    engine: str,
+    most_bytes: int,
+    message: str,
+    tmp_path: Path,
+    full_disk: Callable[[int], AbstractContextManager[None]],
+) -> None:
     recipe, out = tmp_path / "mine.toml", tmp_path / "out"
     recipe.write_text(RECIPE.replace("3.0", "30.0").replace("9.0", "40.0"))
-
-    # No file may grow beyond this, and the system says so as on a full disk: the larger limit first meets a noisy
-    # image of 1280 x 960 pixels, the smaller one a temporary file or the manifest.
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-
-    _assert_refused(_run("render", recipe, "--out", out, "--workers", "1", "--engine", engine, before=limit), message)
+    # The larger limit first meets a noisy image of 1280 x 960 pixels, the smaller one a temporary file or the manifest.
+    with full_disk(most_bytes):
+        result = _run("render", recipe, "--out", out, "--workers", "1", "--engine", engine)
+    _assert_refused(result, message)
     assert not out.exists()
 
 

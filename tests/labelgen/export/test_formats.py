@@ -7,9 +7,9 @@ import importlib
 import json
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.pair_faults import PairFaults
+from droguekit.cli.main import WRONG_INPUT, run
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 from tests.support.drawn_pairs import Pair
@@ -122,25 +123,20 @@ def test_images_behind_links_are_refused(name: str, mixed_dataset: Path, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-# No file may grow beyond 2 kB, as on a disk that has just become full.
-ON_A_FULL_DISK = """
-import resource, sys
-from droguekit.cli.main import run
-resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-sys.exit(run(["export", sys.argv[1], "--format", sys.argv[2], "--out", sys.argv[3]]))
-"""
-
-
 @pytest.mark.parametrize("name", ["coco", "speed", "webdataset", "huggingface", "parquet"])
 def test_a_full_disk_is_one_line_and_leaves_nothing(
-    name: str, dataset_by_preset: Callable[..., Any], tmp_path: Path
+    name: str,
+    dataset_by_preset: Callable[..., Any],
+    tmp_path: Path,
+    full_disk: Callable[[int], AbstractContextManager[None]],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     # Images of 12 bits are written anew instead of linked.
     dataset = dataset_by_preset("mono", {"output_bits": 12})
-    command = [sys.executable, "-c", ON_A_FULL_DISK, str(dataset), name, str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    errors = [line for line in done.stderr.splitlines() if not line.startswith("pairs: ")]
-    assert done.returncode == 2 and len(errors) == 1, done.stderr
+    with full_disk(2000):
+        code = run(["export", str(dataset), "--format", name, "--out", str(tmp_path / "out")])
+    errors = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("pairs: ")]
+    assert code == WRONG_INPUT and len(errors) == 1, errors
     assert "cannot be written" in errors[0] and "File too large" in errors[0]
     assert [path for path in tmp_path.rglob("*") if path.is_file() or path.name.endswith(".part")] == []
 

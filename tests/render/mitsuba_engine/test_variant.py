@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from droguekit.cli.main import WRONG_INPUT, run
 from render.engine import EngineUnavailableError, engine_notice
 from render.mitsuba_engine import gpu_trial, variant
 from render.mitsuba_engine.variant import Variant, probe_variant
@@ -274,17 +275,14 @@ def test_pixels_are_of_one_gpu_and_driver(monkeypatch: pytest.MonkeyPatch) -> No
         ["plan", "smoke"],
     ],
 )
-def test_commands_end_with_one_line_before_any_work(arguments: list[str], tmp_path: Path) -> None:
+def test_commands_end_with_one_line_before_any_work(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    words = [word.replace("{out}", str(out)) for word in arguments]
-    done = subprocess.run(
-        [sys.executable, "-m", "droguekit.cli.main", *words, "--device", "cuda"],
-        env={**os.environ, "DRJIT_LIBCUDA_PATH": "/nonexistent/libcuda.so.1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 2
-    last = done.stderr.splitlines()[-1]
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
+    code = run([*(word.replace("{out}", str(out)) for word in arguments), "--device", "cuda"])
+    told = capsys.readouterr().err
+    last = told.splitlines()[-1]
+    assert code == WRONG_INPUT
     assert last.startswith("droguekit: error: device cuda: no NVIDIA driver") and last.endswith("or take device cpu")
-    assert "Traceback" not in done.stderr and not (out / "frames").exists()
+    assert "Traceback" not in told and not (out / "frames").exists()
