@@ -39,8 +39,9 @@ _RECTIFICATION = ("R1", "R2", "P1", "P2")
 _POSE = ("R", "T")
 _ORB_SLAM_KEY = "LEFT.K"
 
-# A calibration opens a bracket or a tag for each of some dozen matrices, and for each view where it holds the points.
-_MOST_OPENED = 2000
+# A calibration opens a bracket or a tag for each of some dozen matrices, and for each view where it holds the points; a
+# matrix has four keys. OpenCV's reader takes time with the square of the keys.
+_MOST_OPENED, _MOST_KEYS = 2000, 8000
 _XML_TAG = re.compile(r"<[\w]")
 # OpenCV's reader of XML takes time with the square of the numbers in one element: two seconds for so many. Two hundred
 # points in sixty views are 24,000 numbers.
@@ -131,13 +132,15 @@ def read_calibration_text(path: Path) -> str:
 
     Raises:
         OSError: it is no regular file, or too large.
-        ValueError: it is not UTF-8, nested too deep, or holds too many numbers.
+        ValueError: it is not UTF-8, nested too deep, or holds too many keys or numbers.
     """
     text = read_text(path)
     # An upper limit of the depth, which is the same in YAML, XML and JSON.
     opened = max(text.count("["), text.count("{"), len(_XML_TAG.findall(text)))
     if opened > _MOST_OPENED or _DEEP_BLOCK.search(text):
         raise ValueError(f"{path}: is nested too deep for a calibration")
+    if text.count(":") > _MOST_KEYS:
+        raise ValueError(f"{path}: has more than {_MOST_KEYS} keys, too many for a calibration")
     if text.lstrip("\ufeff \t\r\n").startswith("<") and any(
         len(part) > 2 * _MOST_NUMBERS and len(part.split()) > _MOST_NUMBERS for part in text.split("<")
     ):

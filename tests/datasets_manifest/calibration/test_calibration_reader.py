@@ -262,6 +262,14 @@ def test_calibrations_nested_too_deep_are_refused(name: str, text: str, tmp_path
         read_calibration([tmp_path / name])
 
 
+def test_too_many_keys_are_refused(tmp_path: Path) -> None:
+    """OpenCV's reader takes time with their square."""
+    path = tmp_path / "storage.json"
+    path.write_text(json.dumps(dict.fromkeys(map(str, range(9000)), 0)))
+    with pytest.raises(ValueError, match=r"storage\.json: has more than 8000 keys, too many for a calibration"):
+        read_calibration([path])
+
+
 def test_an_element_of_too_many_numbers_is_refused(tmp_path: Path) -> None:
     """OpenCV's reader takes minutes for a megabyte of them."""
     path = tmp_path / "storage.xml"
