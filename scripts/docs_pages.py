@@ -1,6 +1,6 @@
 """What `mkdocs build` needs besides the pages of docs/: those that stand outside of it, and the examples as pages.
 
-The studies' READMEs and results, the changelog and CONTRIBUTING stay where a reader of the repository looks for them.
+The studies' READMEs, results, the changelog and CONTRIBUTING stay where a reader of the repository looks for them.
 This hook of mkdocs adds them to the built pages, makes a page of every script and notebook of docs/examples, and
 rewrites the links between all of them.
 """
@@ -17,7 +17,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "studies/*/*.md")
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "studies/*/*.md", "tests/fuzz/RESULTS.md")
 EXAMPLES = "examples"
 # Lines of code are wider than a page between two columns.
 WIDE = "---\nhide: [toc]\n---\n\n"

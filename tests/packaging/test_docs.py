@@ -30,7 +30,8 @@ from nav.pose.pose_method import Observation, Solution
 from nav.runner import method_names
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("studies/*/*.md")])
+PLACES = ("*.md", "docs/**/*.md", "studies/*/*.md", "tests/*/*.md")
+PAGES = sorted(page for pattern in PLACES for page in REPOSITORY.glob(pattern))
 
 CODE = ("geometry", "drogue_models", "datasets_manifest", "scenes", "render", "labelgen", "nav", "droguekit", "studies")
 
