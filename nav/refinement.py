@@ -15,6 +15,7 @@ from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from nav.centroids.annuli import AnnulusFits, fit_annuli
+from nav.centroids.binary_centroids import smallest_gap_m
 from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import LARGEST_SCALE, DiscFits
@@ -36,6 +37,8 @@ _LEAST_WEIGHT = 0.01
 _LEAST_STEP_PX = 0.5
 # With fewer fitted markers, which a pose needs with one to spare, all markers stay as they were.
 _LEAST_MARKERS = 4
+# The edge model takes all light beside a disc as the background's: that of neighbours as close as this enters a window.
+_CLOSE_PX = 6.0
 # No part of the edge of smaller markers is clear of the rim's, so the other colours get the weight that removes that.
 _BALANCED_BELOW_PX = 8.0
 
@@ -66,7 +69,8 @@ def refine(
     radius_px = observation.rig.camera.fx_px * layout.radius_m / rough.left_from_drogue.translation_m[2]
     discs = _initial_discs(observation, rough, radius_px)
     face = _face_background(layout, np.nonzero(observation.seen)[1], radius_px / layout.radius_m)
-    if radius_px < EDGELESS_RADIUS_PX:
+    gap_px = (smallest_gap_m(layout) / layout.radius_m - 2) * radius_px
+    if radius_px < EDGELESS_RADIUS_PX or (radius_px <= LARGEST_SMALL_RADIUS_PX and gap_px < _CLOSE_PX):
         return _refine_small(images, observation, discs, face)
     is_narrow = face is not None and face.margin_px <= VISIBLE_MARGIN_PX
     if is_narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:

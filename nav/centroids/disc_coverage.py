@@ -82,11 +82,11 @@ class SpreadDiscs:
 
 
 def spread_discs(centers_px: Array, radii_px: Array, sigma_px: Array, half: int, cells: int) -> SpreadDiscs:
-    """Pictures of discs.
+    """Pictures of discs, or of ellipses along rows and columns.
 
     Args:
         centers_px: (N, 2) from the middles of their windows.
-        radii_px: (N,)
+        radii_px: (N,), or (N, 2) along rows and along columns.
         sigma_px: (N,) standard deviation of the Gaussian spread.
         half: windows have 2 half + 1 pixels a side.
         cells: per side of a pixel, in which the spread is computed.
@@ -97,7 +97,12 @@ def spread_discs(centers_px: Array, radii_px: Array, sigma_px: Array, half: int,
     edges = np.append(places, places[-1] + 1) / cells - half - 0.5
     x, y = edges - centers_px[:, :1], edges - centers_px[:, 1:]
     area, by_x, by_y = (np.empty((*x.shape, x.shape[1])) for _ in range(3))
-    disc_areas_below(x, y, np.ascontiguousarray(radii_px, dtype=np.float64), area, by_x, by_y)
+    # A disc is stretched along its rows.
+    along, across = radii_px.reshape(len(x), -1)[:, [0, -1]].astype(np.float64).T
+    stretch = (along / across)[:, None]
+    disc_areas_below(x / stretch, y, np.ascontiguousarray(across), area, by_x, by_y)
+    area *= stretch[..., None]
+    by_y *= stretch[..., None]
     spread = _spread(places, size, cells, sigma)
     broader = (_spread(places, size, cells, sigma + _STEP_PX) - _spread(places, size, cells, sigma - _STEP_PX)) / (
         2 * _STEP_PX

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from nav.centroids.blurred_edges import DISC_BACKGROUND, DISC_LEVEL, DISC_WIDTH, START_WIDTH_PX, parameter_shapes
@@ -24,6 +25,7 @@ from nav.centroids.centroid_uncertainty import (
 )
 from nav.centroids.discs import (
     DiscFits,
+    are_clipped,
     contrasts,
     disc_model,
     initial_disc_parameters,
@@ -54,6 +56,8 @@ _CAUCHY_SIGMA = 2.385
 # Share of a pixel's light that comes from within the disc.
 _ON_THE_DISC = 0.05
 _LARGEST_LEVERAGE = np.float32(0.9)
+# Of a disc's light: where all pixels with more of it are clipped, the disc has no edge.
+_LEAST_SEEN = np.float32(1e-3)
 # Squared shift of a centre over its variance, chi-square of two: even light exceeds it once in a hundred discs.
 _LARGEST_SHIFT_CHI2 = 9.2
 # The other colours' variance beside a marker is part of the difference's, so at most as large; where the difference's
@@ -115,14 +119,20 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, f
     # The linear steps so far change parameters and residuals, but not leverages.
     minimum, present = first.minimum, first.pixels.present
     leverages = np.minimum(minimum.leverages(minimum.covariance(), present), _LARGEST_LEVERAGE)
-    difference_noise = noise = _noise(minimum, leverages, first.pixels, inside)
+    # Of a clipped disc only light up to the sensor's range is seen.
+    seen = np.where(
+        are_clipped(discs, first.pixels), (inside * first.pixels.present).max(axis=1, initial=0), np.float32(1)
+    )
+    seen = np.maximum(seen, _LEAST_SEEN)
+    inside /= seen[:, None]
+    difference_noise = noise = _noise(minimum, leverages, first.pixels, inside, seen)
     if shaded and is_difference:
-        minimum, pixels = restore_even_colors(minimum, first.pixels, noise, contrasts(minimum))
+        minimum, pixels = restore_even_colors(minimum, first.pixels, noise, seen * contrasts(minimum))
         first = replace(first, minimum=minimum, pixels=pixels)
-        noise = _noise(minimum, leverages, pixels, inside)
-    weights = first.pixels.present / noise.variances(inside, contrasts(minimum).astype(np.float32)[:, None])
+        noise = _noise(minimum, leverages, pixels, inside, seen)
+    weights = first.pixels.present / noise.variances(inside, (seen * contrasts(minimum)).astype(np.float32)[:, None])
     final = _fit_weighted(first, weights, robust=not is_difference)
-    return _judged(discs, final, weights, inside, (noise, difference_noise), is_difference)
+    return _judged(discs, final, weights, seen, (noise, difference_noise), is_difference)
 
 
 def _fit_equal_weights(
@@ -162,10 +172,16 @@ def _fit_given_motion(
         if beyond is not None:
             pixels = pixels_on_face(face, start, pixels, beyond, motions, signals[0])
     sloped = not is_difference or (shaded and bool(start.radii_px.min() >= _LEAST_RADIUS_FOR_FACE_SLOPE_PX))
-    still = disc_model(pixels, sloped, shaded, beyond)
+    is_clipped = are_clipped(start, pixels)
+    still = disc_model(pixels, sloped, shaded, beyond, is_clipped)
     model = still if motions is None else motion_blurred(still, motions, (0,))
     count = 2 * sloped + 2 * shaded + (0 if beyond is None else beyond.shape[1])
-    begin = evaluate(model, pixels.values, pixels.present, initial_disc_parameters(pixels, start.shapes_px, count))
+    first = initial_disc_parameters(pixels, start.shapes_px, count)
+    # Clipped pixels only say that the light is at least theirs: what is left shows where the edge is.
+    pixels = pixels.only(~pixels.clipped)
+    begin = evaluate(model, pixels.values, pixels.present, first)
+    if is_clipped.any():
+        begin = _with_unclipped_level(model, pixels, begin, is_clipped)
     minimum = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
     if face is None or beyond is None or shaded:
         return pixels, still, minimum
@@ -174,9 +190,23 @@ def _fit_given_motion(
     lost = ~np.isfinite(minimum.parameters).all(axis=1) | ~are_positive(parameter_shapes(minimum.parameters))
     found = _fitted_ellipses(start, pixels, minimum, tuple("the fit left the disc" if each else None for each in lost))
     width_px = float(np.median(minimum.parameters[:, DISC_WIDTH]))
-    still = disc_model(pixels, sloped, shaded, background_shares(face, found, pixels, width_px, motions))
+    shares = background_shares(face, found, pixels, width_px, motions)
+    still = disc_model(pixels, sloped, shaded, shares, is_clipped)
     model = still if motions is None else motion_blurred(still, motions, (0,))
     return pixels, still, evaluate(model, pixels.values, pixels.present, minimum.parameters)
+
+
+def _with_unclipped_level(model: Model, pixels: OutlinePixels, begin: Minimum, chosen: NDArray[np.bool_]) -> Minimum:
+    """A start whose chosen discs have the level that fits their unclipped pixels best.
+
+    It may be many times the sensor's range. A fit that had to find it along with the outline would end on the way.
+    """
+    parameters, inside = begin.parameters.copy(), begin.jacobian[:, DISC_LEVEL]
+    beside = pixels.values - parameters[:, DISC_BACKGROUND, None].astype(np.float32) * (1 - inside)
+    weighted = pixels.present * inside
+    level = (weighted * beside).sum(axis=1) / np.maximum((weighted * inside).sum(axis=1), np.finfo(np.float32).tiny)
+    parameters[chosen, DISC_LEVEL] = np.maximum(level, parameters[:, DISC_LEVEL])[chosen]
+    return evaluate(model, pixels.values, pixels.present, parameters)
 
 
 def _correct_response(group: _GroupFit, inside: Array32) -> _GroupFit:
@@ -185,8 +215,8 @@ def _correct_response(group: _GroupFit, inside: Array32) -> _GroupFit:
     return replace(group, minimum=minimum, pixels=replace(group.pixels, values=group.pixels.values - response))
 
 
-def _noise(fit: Minimum, leverages: Array32, pixels: OutlinePixels, inside: Array32) -> NoiseModel:
-    return measure_noise(fit.residuals**2 / (1 - leverages), pixels.present, inside, contrasts(fit))
+def _noise(fit: Minimum, leverages: Array32, pixels: OutlinePixels, inside: Array32, seen: Array32) -> NoiseModel:
+    return measure_noise(fit.residuals**2 / (1 - leverages), pixels.present, inside, seen * contrasts(fit))
 
 
 def _fit_weighted(group: _GroupFit, weights: Array32, robust: bool) -> _GroupFit:
@@ -205,7 +235,7 @@ def _judged(
     discs: Ellipses,
     final: _GroupFit,
     weights: Array32,
-    inside: Array32,
+    seen: Array32,
     noises: tuple[NoiseModel, NoiseModel],
     is_difference: bool,
 ) -> DiscFits:
@@ -215,22 +245,23 @@ def _judged(
         discs: initial outlines.
         final: the weighted fit.
         weights: (N, K) inverse variances.
-        inside: (N, K) share of the light from within.
+        seen: (N,) the brightest light of a disc that is not clipped, as a share of its light.
         noises: of the fitted pixels, and of the difference of colours.
         is_difference: whether the signal is a difference of colours.
     """
     pixels, minimum = final.pixels, final.minimum
     # What a plain picture shows beside a disc says nothing about the disc.
-    judged = weights if is_difference else weights * (minimum.jacobian[:, DISC_LEVEL] > _ON_THE_DISC)
-    contrast = contrasts(minimum)
+    own = minimum.jacobian[:, DISC_LEVEL] > _ON_THE_DISC * seen[:, None]
+    judged = weights if is_difference else weights * own
+    contrast = seen * contrasts(minimum)
     spread = residual_spread(minimum.residuals, judged, pixels, SECTORS, contrast, minimum.parameters.shape[1])
     factor = edge_noise_factor(minimum, judged, pixels.x_px, pixels.y_px)
     cov = widen_for_nonlinearity(minimum.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None])
-    reasons = rejection_reasons(discs, pixels, minimum, inside, cov, noises[0], spread)
+    reasons = rejection_reasons(discs, pixels, minimum, cov, noises[0], spread)
     return DiscFits(
         ellipses=_fitted_ellipses(discs, pixels, minimum, reasons),
         cov_px2=cov,
-        contrast_dn=contrast,
+        contrast_dn=contrasts(minimum),
         background_dn=minimum.parameters[:, DISC_BACKGROUND],
         edge_width_px=minimum.parameters[:, DISC_WIDTH],
         chi2_per_dof=spread.chi2_per_dof,

@@ -35,8 +35,9 @@ _CLEAR_PX = 1.0
 # pixels that the standard deviation of the centre [px] shows when they are too faint.
 _LEAST_CONTRAST_SIGMA = 2.5
 _LARGEST_SIGMA_PX = 0.2
-# Share of a disc's own pixels; clipping all of a disc keeps its centre, clipping part of it does not.
-_MOST_CLIPPED_FRACTION = 0.05
+# Share of a disc's own pixels, and distance of the clipped ones' middle from its centre, as a share of its radius: a
+# disc that is clipped evenly keeps its centre, one that is clipped on one side does not.
+_MOST_CLIPPED_FRACTION, _MOST_CLIPPED_ASIDE = 0.05, 0.15
 # Residuals of twice the frame's noise that exceed this share of the contrast come from another object.
 _LARGEST_CHI2, _ROUGH_SHARE = 4.0, 0.04
 # Largest move of an outline from its start, as a share of its radius; beyond, it is another object's.
@@ -44,7 +45,13 @@ _LARGEST_MOVE_FRACTION = 0.5
 LARGEST_SCALE = 1.6
 
 
-def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
+def disc_model(
+    pixels: OutlinePixels,
+    slope_outside: bool,
+    slope_inside: bool,
+    further: Array32 | None = None,
+    held: NDArray[np.bool_] | None = None,
+) -> Model:
     """Intensity of a blurred edge between two planes of light, `I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
 
     S is the share of light from within, see `nav.centroids.blurred_edges`.
@@ -54,6 +61,7 @@ def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, f
         slope_outside: whether the background's plane g is fitted.
         slope_inside: whether the disc's plane h is fitted.
         further: (N, E, K) shares F of other backgrounds, whose lights k above b are the last parameters.
+        held: (N,) whether a disc's edge keeps the width that it has, or None where all are fitted.
     """
     x, y = pixels.x_px, pixels.y_px
     if further is None:
@@ -64,6 +72,8 @@ def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, f
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
         given, widths = parameters.astype(np.float32), edge_widths(parameters[:, DISC_WIDTH])
         draw_discs(given, widths, (slope_outside, slope_inside), x, y, further, picture, jacobian)
+        if held is not None:
+            jacobian[held, DISC_WIDTH] = 0
         return picture, jacobian
 
     return model
@@ -189,14 +199,12 @@ def rejection_reasons(
     discs: Ellipses,
     pixels: OutlinePixels,
     fit: Minimum,
-    inside: Array32,
     cov_px2: Array,
     noise: NoiseModel,
     spread: ResidualSpread,
 ) -> tuple[str | None, ...]:
     """Reason to reject each disc, None for accepted ones; where several apply, the first of this order."""
-    contrast, own = contrasts(fit), pixels.present * (inside > 0.5)
-    clipped = (own * pixels.clipped).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
+    contrast, clipped = contrasts(fit), _clipped_aside(discs, pixels)
     bright = noise.dark_dn2 + noise.per_signal_dn * np.maximum(contrast, 0)
     moved = np.hypot(*(fit.parameters[:, :2] + pixels.origins_px - discs.centers_px).T)
     shapes = parameter_shapes(fit.parameters)
@@ -209,10 +217,42 @@ def rejection_reasons(
     )
     tests = (
         (pixels.truncated, "cut by the edge of the image"),
-        (clipped > _MOST_CLIPPED_FRACTION, "clipped: brighter than the sensor's range"),
+        (clipped, "clipped in part: brighter than the sensor's range"),
         (~(contrast > _LEAST_CONTRAST_SIGMA * np.sqrt(bright)), "no contrast"),
         (lost | astray, "the fit left the disc"),
         (spread.uneven | rough, "uneven: cut by a shadow or hidden in part"),
         (~placed, "too faint to be placed"),
     )
     return tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
+
+
+def are_clipped(discs: Ellipses, pixels: OutlinePixels) -> NDArray[np.bool_]:
+    """(N,) whether more than a few of the pixels within (N,) discs are clipped.
+
+    What is left of such a disc does not tell its light, its size and the width of its edge from each other.
+    """
+    if not pixels.clipped.any():
+        return np.zeros(len(discs), np.bool_)
+    own, clipped = _own_and_clipped(discs, pixels)
+    many: NDArray[np.bool_] = clipped.sum(axis=1) > _MOST_CLIPPED_FRACTION * own.sum(axis=1)
+    return many
+
+
+def _own_and_clipped(discs: Ellipses, pixels: OutlinePixels) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N, K) whether pixels lie within the discs, and whether such pixels are clipped."""
+    own = ((pixels.present > 0) | pixels.clipped) & (edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px) > 0)
+    return own, own & pixels.clipped
+
+
+def _clipped_aside(discs: Ellipses, pixels: OutlinePixels) -> NDArray[np.bool_]:
+    """(N,) whether discs are clipped, and that more on one side than by chance."""
+    if not pixels.clipped.any():
+        return np.zeros(len(discs), np.bool_)
+    clipped = _own_and_clipped(discs, pixels)[1]
+    count = np.maximum(clipped.sum(axis=1), 1)
+    x, y = ((clipped * each).sum(axis=1) / count for each in (pixels.x_px, pixels.y_px))
+    # Places spread evenly over a disc have a standard deviation of half its radius along each axis.
+    by_chance = 0.5 / np.sqrt(count)
+    far = np.hypot(x, y) / discs.radii_px > _MOST_CLIPPED_ASIDE + by_chance
+    aside: NDArray[np.bool_] = far & are_clipped(discs, pixels)
+    return aside

@@ -47,6 +47,10 @@ _WITHIN_PIXEL_PX = 0.2
 # with less of the usual light is hidden in part.
 _LAMPS_DIFFER, _FACES_DIFFER, _LEAST_SPREAD_DN = 0.03, 0.1, 1.0
 _LEAST_ALIKE, _LEAST_LIGHT = 4, 0.5
+# Shorter images of a round face are no images of one; drogues tilt by some ten degrees.
+_LEAST_ASPECT = 0.8
+# The light of a neighbour over the own one; beyond, one of both is no lamp.
+_LARGEST_RATIO = 3.0
 # An own light of fewer standard deviations may be noise.
 _LEAST_STRENGTH = 4.0
 # Of a disc's light this share must lie in pixels that are used; clipped ones are not.
@@ -207,11 +211,13 @@ def _by_color(pixels: NDArray[Any]) -> NDArray[Any]:
 def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells: int) -> _Fit:
     """Fit all discs by one kind of spread; its width, neighbours' light and the noise follow from the fits before."""
     centers, sigma_px, variances = discs.centers_px, _FIRST_SIGMA_PX, np.ones_like(windows.values)
-    beside, common, cov = np.zeros_like(windows.values), None, None
+    radii = _radii_px(discs, face)
+    common, cov, amounts = None, None, None
     size = windows.values.shape[1]
     for turn in range(_TURNS):
         basis, chosen = _background_basis(windows, discs, centers, face, (sigma_px, cells))
-        model = _disc_model(windows, discs.radii_px, basis, (sigma_px, cells))
+        beside = _neighbours(windows, discs.eyes, radii, (centers, amounts), (sigma_px, cells))
+        model = _disc_model(windows, radii, (beside, basis), (sigma_px, cells))
         places = _likely_places(discs, centers, cov, face) - windows.middles_px
         count = windows.classes.shape[1] * (1 + basis.shape[1])
         prior = (
@@ -220,8 +226,7 @@ def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells:
             else replace(common, places_px=places)
         )
         weights = np.concatenate([windows.present * chosen / variances, prior.weights], axis=1)
-        light = windows.values - beside
-        data, start = np.concatenate([light, prior.means], axis=1), prior.places_px
+        data, start = np.concatenate([windows.values, prior.means], axis=1), prior.places_px
         if cells == 1 and turn > 0 and discs.radii_px.min() < _FLAT_RADIUS_PX:
             start = _best_places(model, data, weights, prior)
         minimum = minimise(
@@ -233,8 +238,8 @@ def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells:
         centers = np.where(kept[:, None], windows.middles_px + minimum.parameters[:, :2], discs.centers_px)
         cov = minimum.covariance()[:, :2, :2] if turn else None
         variances = _variances(windows, minimum, weights)
-        sigma_px = _common_sigma(windows, discs.radii_px, minimum, weights, (sigma_px, cells))
-        beside = _light_of_neighbours(windows, discs, minimum, (sigma_px, cells))
+        sigma_px = _common_sigma(windows, radii, minimum, weights, (sigma_px, cells))
+        amounts = minimum.parameters[:, 2 : 2 + windows.classes.shape[1]]
         squares, counted = weights[:, :size] * minimum.residuals[:, :size] ** 2, (weights[:, :size] > 0).sum(axis=1)
         misfit = squares.sum(axis=1) / np.maximum(counted, 1)
         common = _common_amounts(discs, minimum, prior, misfit, (face is not None, windows.classes.shape[1]))
@@ -243,9 +248,25 @@ def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells:
     # A spread by which all discs would happen to lie at the middles of pixels is less likely than one that leaves their
     # places open.
     loss = misfit - float(np.log(np.linalg.det(minimum.covariance()[:, :2, :2])).sum())
-    light = windows.samples(_pictures(windows, discs.radii_px, minimum.parameters, (sigma_px, cells)).light)
+    light = windows.samples(_pictures(windows, radii, minimum.parameters, (sigma_px, cells)).light)
     share = (light * (used > 0)).sum(axis=1) / light.sum(axis=1)
     return _Fit(minimum, sigma_px, weights, size, share, loss)
+
+
+def _radii_px(discs: Ellipses, face: FaceBackground | None) -> Array:
+    """(N, 2) radii of discs along rows and columns, of a face that may be tilted by what the places of all discs say.
+
+    An ellipse that is neither along rows nor along columns has the widths and the area of the one that is taken.
+    """
+    round_ = np.repeat(discs.radii_px[:, None], 2, axis=1)
+    maps = None if face is None else face.maps_px(discs.eyes, discs.centers_px)
+    if maps is None:
+        return round_
+    along = np.hypot(maps[:, :2, 0], maps[:, :2, 1])
+    longest, shortest = np.linalg.svd(maps[..., :2], compute_uv=False).T
+    scale = np.sqrt(np.maximum(shortest / longest, _LEAST_ASPECT) / along.prod(axis=1))
+    radii: Array = round_ * scale[:, None] * along
+    return radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,16 +373,25 @@ def _pictures(windows: _Windows, radii_px: Array, parameters: Array, spread: tup
     return spread_discs(inside, radii_px, np.full(len(radii_px), sigma_px), windows.half, cells)
 
 
-def _disc_model(windows: _Windows, radii_px: Array, basis: Array32, spread: tuple[float, int]) -> Model:
-    """The picture of discs, and last their parameters, of which some is known before the fit."""
-    classes = windows.classes
+def _disc_model(
+    windows: _Windows, radii_px: Array, beside: tuple[Array32, Array32], spread: tuple[float, int]
+) -> Model:
+    """The picture of discs, and last their parameters, of which some is known before the fit.
+
+    Args:
+        windows: around the discs.
+        radii_px: (N, 2) as in `spread_discs`.
+        beside: (N, C, K) light of the neighbours and (N, B, K) pictures of the light of the background.
+        spread: of the light.
+    """
+    classes, (neighbours, basis) = windows.classes, beside
     count, colors, size = classes.shape
     backgrounds = (classes[:, :, None] * basis[:, None]).reshape(count, -1, size)
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         pictures = _pictures(windows, radii_px, parameters, spread)
         light, by_x, by_y = (windows.samples(each) for each in (pictures.light, pictures.by_x, pictures.by_y))
-        linear = np.concatenate([classes * light[:, None], backgrounds], axis=1)
+        linear = np.concatenate([classes * light[:, None] + neighbours, backgrounds], axis=1)
         amounts = parameters[:, 2:].astype(np.float32)
         level = np.einsum("nc,nck->nk", amounts[:, :colors], classes)
         own = np.arange(parameters.shape[1])
@@ -432,18 +462,37 @@ def _common_sigma(
     return float(np.clip(sigma_px, *_SIGMAS_PX))
 
 
-def _light_of_neighbours(windows: _Windows, discs: Ellipses, minimum: Minimum, spread: tuple[float, int]) -> Array32:
-    """(N, K) light of all other discs in each disc's window. [DN]"""
-    centers = windows.middles_px + minimum.parameters[:, :2]
-    reach_px = windows.half + discs.radii_px.max() + 4 * spread[0]
-    gaps = np.abs(centers[None] - windows.middles_px[:, None]).max(axis=2)
-    here, other = np.nonzero((gaps < reach_px) & (discs.eyes[:, None] == discs.eyes) & ~np.eye(len(discs), dtype=bool))
-    beside = np.zeros_like(windows.values)
+def _neighbours(
+    windows: _Windows,
+    eyes: NDArray[np.int64],
+    radii_px: Array,
+    found: tuple[Array, Array | None],
+    spread: tuple[float, int],
+) -> Array32:
+    """(N, C, K) pictures of all other discs in each disc's window, in units of its own light.
+
+    So the light of touching discs, which each one's own picture holds too, is fitted in one step.
+
+    Args:
+        windows: around the discs.
+        eyes: (N,) of the discs.
+        radii_px: (N, 2) as in `spread_discs`.
+        found: (N, 2) where they are [px], and (N, C) their light in each colour; all are alike when None.
+        spread: of the light.
+    """
+    centers_px, amounts = found
+    colors = windows.classes.shape[1]
+    beside = np.zeros((len(eyes), *windows.classes.shape[1:]), np.float32)
+    reach_px = windows.half + radii_px.max() + 4 * spread[0]
+    gaps = np.abs(centers_px[None] - windows.middles_px[:, None]).max(axis=2)
+    here, other = np.nonzero((gaps < reach_px) & (eyes[:, None] == eyes) & ~np.eye(len(eyes), dtype=bool))
     if len(here) == 0:
         return beside
-    places, sigma = centers[other] - windows.middles_px[here], np.full(len(here), spread[0])
-    pictures = windows.samples(spread_discs(places, discs.radii_px[other], sigma, windows.half, spread[1]).light)
-    colors = windows.classes.shape[1]
-    amounts = np.maximum(minimum.parameters[other, 2 : 2 + colors], 0).astype(np.float32)
-    np.add.at(beside, here, np.einsum("mc,mck->mk", amounts, windows.classes[here]) * pictures)
+    places, sigma = centers_px[other] - windows.middles_px[here], np.full(len(here), spread[0])
+    pictures = windows.samples(spread_discs(places, radii_px[other], sigma, windows.half, spread[1]).light)
+    shares = np.ones((len(here), colors))
+    if amounts is not None:
+        own = np.maximum(amounts, np.finfo(np.float32).tiny)
+        shares = np.where(amounts[here] > 0, np.clip(own[other] / own[here], 0, _LARGEST_RATIO), 1.0)
+    np.add.at(beside, here, shares.astype(np.float32)[..., None] * windows.classes[here] * pictures[:, None])
     return beside

@@ -26,6 +26,20 @@ def test_without_spread_it_is_the_area_in_each_pixel(center: tuple[float, float]
     assert np.allclose(drawn.light[0], counted(center, radius), atol=1e-3)
 
 
+def test_an_ellipse_is_the_area_in_each_pixel() -> None:
+    center, radii = np.array([0.31, -0.44]), np.array([1.9, 1.6])
+    drawn = spread_discs(center[None], radii[None], np.array([1e-9]), HALF, 1)
+    at = (np.arange(400 * (2 * HALF + 1)) + 0.5) / 400 - HALF - 0.5
+    fine = ((at - center[0]) / radii[0]) ** 2 + ((at[:, None] - center[1]) / radii[1]) ** 2 < 1
+    side = 2 * HALF + 1
+    assert np.allclose(drawn.light[0], fine.reshape(side, 400, side, 400).mean(axis=(1, 3)), atol=1e-3)
+    step = 1e-6
+    for axis, slope in enumerate((drawn.by_x, drawn.by_y)):
+        moved = center[None] + step * np.eye(2)[axis]
+        later = spread_discs(moved, radii[None], np.array([1e-9]), HALF, 1)
+        assert np.allclose(slope, (later.light - drawn.light) / step, atol=1e-4)
+
+
 @pytest.mark.parametrize("cells", [1, 4])
 def test_no_light_is_lost_and_its_middle_is_the_discs(cells: int) -> None:
     centers, radii = np.array([[0.2, -0.3], [0.45, 0.1]]), np.array([0.8, 1.3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,33 @@ def test_spoilt_discs_are_rejected_with_a_reason(kind: str, reason: str, differe
     error = (fits.ellipses.centers_px - truth.centers_px)[1:]
     # The good ones stay good: 30 errors, 1.25 of the bound, know their rms to 13 %.
     assert np.sqrt(np.mean(error**2)) < 1.8 * center_bound_px(10.0, DAY)
+
+
+@pytest.mark.parametrize("times_range", [0.9, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("difference", [True, False])
+def test_discs_brighter_than_the_sensors_range_are_placed_by_what_is_not_clipped(
+    times_range: float, difference: bool
+) -> None:
+    highest_dn, rng = 255.0, np.random.default_rng([20, round(10 * times_range)])
+    light = replace(DAY, contrast_e=times_range * highest_dn * DAY.step_e - DAY.background_e)
+    errors, covariances = [], []
+    for _ in range(2):
+        signals, truth = draw_discs(6.0, light, rng, difference=difference)
+        cut = [
+            replace(s, values=np.minimum(s.values, np.float32(highest_dn)), clipped=s.values >= highest_dn)
+            for s in signals
+        ]
+        fits = fit_discs(cut, rough_start(truth, rng))
+        assert fits.accepted.all(), fits.reasons
+        errors.append(fits.ellipses.centers_px - truth.centers_px)
+        covariances.append(fits.cov_px2)
+    error, cov = np.concatenate(errors), np.concatenate(covariances)
+    # As good as discs that fill the range: what is lost within is won by steeper flanks.
+    full = center_bound_px(6.0, replace(DAY, contrast_e=highest_dn * DAY.step_e - DAY.background_e))
+    assert np.sqrt(np.mean(error**2)) < 1.5 * full
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 2
+    # Chi-square of 64: standard deviation of the mean square 0.18.
+    assert 0.4 < nees < 2.0
 
 
 def test_discs_over_the_images_edge_are_rejected() -> None:

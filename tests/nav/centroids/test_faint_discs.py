@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.images import StereoImages
-from nav.centroids.blurred_edges import DISC_LEVEL
 from nav.centroids.centroid_uncertainty import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import contrasts, disc_model, initial_disc_parameters, rejection_reasons
@@ -60,12 +59,12 @@ def test_an_outline_turned_inside_out_is_no_disc() -> None:
         pixels.present,
         initial_disc_parameters(pixels, truth.shapes_px, 0),
     )
-    inside, noise = fit.jacobian[:, DISC_LEVEL], NoiseModel(50.0, 0.02, 0.0)
+    noise = NoiseModel(50.0, 0.02, 0.0)
     cov = np.tile(1e-4 * np.eye(2), (len(truth), 1, 1))
     spread = residual_spread(fit.residuals, pixels.present / 50, pixels, SECTORS, contrasts(fit), 8)
     turned = fit.parameters.copy()
     turned[0, 2:5] *= -1
-    reasons = rejection_reasons(truth, pixels, replace(fit, parameters=turned), inside, cov, noise, spread)
+    reasons = rejection_reasons(truth, pixels, replace(fit, parameters=turned), cov, noise, spread)
     assert reasons[0] == "the fit left the disc"
     assert "the fit left the disc" not in reasons[1:]
 

@@ -83,6 +83,25 @@ def test_a_disc_of_a_pixel_is_placed_to_its_bound_without_bias(lens_first: bool)
     check(1.0, lens_first, 2000.0, draws=5)
 
 
+def test_touching_discs_do_not_draw_each_other_inwards() -> None:
+    """A ring of lamps with less than a pixel between them: the light of both neighbours pulls towards the middle."""
+    radius, count, errors = 1.3, 16, []
+    angle = 2 * np.pi * np.arange(count) / count
+    out = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    for seed in range(2):
+        rng = np.random.default_rng([31, seed])
+        centers = SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2) + 3.4 / (2 * np.sin(np.pi / count)) * out
+        images = [numbers(500 + 3000 * light_of(centers, radius, False), rng) for _ in range(2)]
+        pair = StereoImages(*images, 0.0, 1e-3, bits=12, black_level_dn=float(BLACK_DN))
+        starts = np.concatenate([centers, centers]) + rng.uniform(-0.2, 0.2, (2 * count, 2))
+        fits = fit_small_discs(pair, circles(np.repeat([0, 1], count), starts, np.full(2 * count, radius)))
+        assert fits.accepted.all(), fits.reasons
+        off = fits.ellipses.centers_px - np.concatenate([centers, centers])
+        errors.append((off * np.concatenate([out, out])).sum(axis=1))
+    # Was 0.03 px when each disc was fitted beside the last fits of the others.
+    assert abs(np.mean(errors)) < 0.01
+
+
 @pytest.mark.slow  # ten times as many draws as above, over all sizes: 3 minutes
 @pytest.mark.parametrize("lens_first", [True, False])
 @pytest.mark.parametrize("contrast_e", [600.0, 4000.0])
