@@ -25,7 +25,7 @@ from geometry.se3 import Array, RigidTransform, angles_from_rotation
 from geometry.stereo import Eye
 from labelgen.disc_images import DiscInEye, hub_discs, marker_discs, window_around
 from labelgen.part_pixels import drogue_box, drogue_mask, is_truncated, mask_box
-from render.camera.sensor import MONO_WEIGHTS
+from render.camera.sensor import mono_weights
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sky.photometry import REC709_LUMINANCE
 
@@ -263,7 +263,7 @@ def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
     """(..., C) mean electrons of the sensor's channels, at most a full well."""
     light = radiance_cd_m2.astype(np.float64)
     if frame.is_monochrome:
-        light = light @ MONO_WEIGHTS.T.astype(np.float64)
+        light = light @ mono_weights(frame.sensor).T
     electrons: Array = np.clip(light * frame.sensor.electrons_per_cd_m2(frame.exposure), 0.0, frame.sensor.full_well_e)
     return electrons
 

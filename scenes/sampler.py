@@ -25,7 +25,7 @@ from scenes.flight.sequence import sequence_kinematics
 from scenes.flight.suspension import hang_hose, hose_look_of_scene, hose_of_scene, sample_suspension
 from scenes.flight.trajectory import FrameKinematics, sample_attitude
 from scenes.framing import outline_points_m, sample_distance_m, sample_pose
-from scenes.sky.photometry import luminance
+from scenes.sky.photometry import Radiance, light_in_band
 from scenes.surroundings.bystander_sampling import bystanders_of_frame
 from scenes.surroundings.neighbour_sampling import NeighbourKind, neighbours_of_frame
 from scenes.tanker_sampling import hang_line, tanker_at, tanker_of_scene
@@ -300,18 +300,20 @@ def _sample_twists(rng: np.random.Generator, scene_recipe: Recipe) -> tuple[Arra
 def automatic_exposure(
     law: ExposureLaw, environment: Environment, camera: PinholeCamera, world_from_left: RigidTransform, sensor: Sensor
 ) -> Exposure:
-    """Exposure that brings the luminance that the law meters, see `ExposureLaw`, to the law's level.
+    """Exposure that brings the light that the law meters, see `ExposureLaw`, to the law's level.
 
-    A longer time comes first, because it collects more light; gain only makes up for what the limits of time leave.
+    That is luminance, or behind an infrared filter the light in its band. A longer time comes first, because it
+    collects more light; gain only makes up for what the limits of time leave.
     """
     gain = law.auto_gain
     if law.time_s is not None and gain.low == gain.high:
         return Exposure(time_s=law.time_s, f_number=law.f_number, gain=gain.low)
     ambient = environment_radiance(environment)
     plate = ambient.plate_illuminance_lux(-world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
-    brightest = max(float(luminance(plate)), _DARKEST_CD_M2)
+    brightest = max(float(light_in_band(plate, sensor.band_nm)), _DARKEST_CD_M2)
     if law.auto_meter == "view":
-        brightest = max(brightest, _mean_luminance(ambient, camera, world_from_left))
+        view = _view(ambient, camera, world_from_left)
+        brightest = max(brightest, float(light_in_band(view, sensor.band_nm).mean()))
     one_second = Exposure(time_s=1.0, f_number=law.f_number)
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
     time_s = law.time_s
@@ -322,12 +324,11 @@ def automatic_exposure(
     return Exposure(time_s=time_s, f_number=law.f_number, gain=gain_used)
 
 
-def _mean_luminance(ambient: EnvironmentRadiance, camera: PinholeCamera, world_from_left: RigidTransform) -> float:
-    """Mean luminance of the camera's view without a drogue. [cd/m2]"""
+def _view(ambient: EnvironmentRadiance, camera: PinholeCamera, world_from_left: RigidTransform) -> Radiance:
+    """(H, W, 3) coarse picture of the camera's view without a drogue. [cd/m2]"""
     u, v = np.meshgrid(
         (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
         (np.arange(_METER_ROWS) + 0.5) * camera.height_px / _METER_ROWS,
     )
     rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
-    view = ambient.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
-    return float(luminance(view).mean())
+    return ambient.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))

@@ -100,6 +100,8 @@ class Sensor(FrozenModel):
         black_level_dn: added before the converter clips. [DN of adc_bits]
         encoding: `linear`, or `gamma` (the sRGB curve).
         optics: vignetting and focus.
+        band_nm: middle of the near-infrared band that a filter passes to a monochrome sensor, None for the visible; the
+            responsivity is then that to sunlight through the filter, by the lux of all sunlight. [nm]
     """
 
     name: str = Field(min_length=1, max_length=80)
@@ -114,6 +116,13 @@ class Sensor(FrozenModel):
     black_level_dn: int = Field(ge=0, le=1000)
     encoding: Literal["linear", "gamma"] = "linear"
     optics: Optics = Optics()
+    band_nm: float | None = Field(default=None, ge=750, le=1000, exclude_if=lambda band_nm: band_nm is None)
+
+    @model_validator(mode="after")
+    def _band_needs_a_monochrome_sensor(self) -> Self:
+        if self.band_nm is not None and self.color != "mono":
+            raise ValueError(f"band_nm: needs color = 'mono', got {self.color!r}")
+        return self
 
     def electrons_per_cd_m2(self, exposure: Exposure) -> float:
         """Electrons of one pixel per luminance of the scene. [e- m2/cd]"""

@@ -72,7 +72,8 @@ class LightPrediction:
     Attributes:
         light: `day`, `dusk` or `night`.
         sun_elevation_deg: of the sun.
-        sky_cd_m2, face_cd_m2, marker_cd_m2: luminance in the direction of the drogue, of the face and of a marker.
+        sky_cd_m2, face_cd_m2, marker_cd_m2: luminance in the direction of the drogue, of the face and of a marker; for
+            a sensor behind an infrared filter the light in its band, in units of sunlight.
         exposure_s, gain: of both eyes.
     """
 
@@ -168,18 +169,19 @@ def _distances(recipe: Recipe) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Light in one environment, as (3,) radiances. [cd/m2]"""
+    """Light in one environment, as (3,) radiances [cd/m2], and the sensor's band [nm] or None."""
 
     environment: Environment
     exposure: Exposure
+    band_nm: float | None
     sky: Array
     face: Array
     marker: Array
 
     def told(self, light: str) -> LightPrediction:
-        from scenes.sky.photometry import luminance
+        from scenes.sky.photometry import light_in_band
 
-        sky, face, marker = (float(luminance(each)) for each in (self.sky, self.face, self.marker))
+        sky, face, marker = (float(light_in_band(each, self.band_nm)) for each in (self.sky, self.face, self.marker))
         elevation_deg = self.environment.sun_elevation_deg
         return LightPrediction(light, elevation_deg, sky, face, marker, self.exposure.time_s, self.exposure.gain)
 
@@ -207,7 +209,7 @@ def _scenes(recipe: Recipe) -> Iterator[tuple[str, _Scene]]:
         behind = drogue.face_reflectance_rgb if drogue.body is None else drogue.canopy_reflectance_rgb
         lamp = np.zeros(3) if frame.drogue is None else lamp_radiance_rgb(frame, FIRST_MARKER_ID)
         marker = lamp + np.array(drogue.marker_reflectance_rgb) * lux / np.pi
-        yield light, _Scene(environment, exposure, sky, np.array(behind) * lux / np.pi, marker)
+        yield light, _Scene(environment, exposure, recipe.sensor.band_nm, sky, np.array(behind) * lux / np.pi, marker)
 
 
 def _predict(recipe: Recipe, scene: _Scene, light: str, distance_m: float) -> MarkerPrediction:
@@ -239,7 +241,7 @@ def _marker_light(recipe: Recipe, scene: _Scene, scale_px_per_m: float) -> tuple
     """Contrast, signal to noise, clipped share and the bound of the centre, over all places within a pixel. [px]"""
     from drogue_models.marker_layout import marker_layout
     from nav.centroids.disc_coverage import spread_discs
-    from render.camera.sensor import MONO_WEIGHTS, dn_per_electron
+    from render.camera.sensor import dn_per_electron, mono_weights
 
     sensor, layout = recipe.sensor, marker_layout(recipe.drogue)
     radius_px = layout.radius_m * scale_px_per_m
@@ -248,7 +250,7 @@ def _marker_light(recipe: Recipe, scene: _Scene, scale_px_per_m: float) -> tuple
     drawn = spread_discs(_PHASES, size, np.full(len(_PHASES), sensor.psf_sigma_px), half, 1)
     on_face = _share_of_face(recipe, scale_px_per_m, half, sensor.psf_sigma_px)
     electrons = sensor.electrons_per_cd_m2(scene.exposure)
-    colors = MONO_WEIGHTS if sensor.color == "mono" else np.eye(3)
+    colors = mono_weights(sensor) if sensor.color == "mono" else np.eye(3)
     # A mosaic measures one colour a pixel: a quarter, a half and a quarter of the pixels.
     shares = np.array([0.25, 0.5, 0.25]) if sensor.color == "bayer" else np.ones(len(colors))
     step_e = 2.0 ** (sensor.adc_bits - sensor.output_bits) / dn_per_electron(sensor, scene.exposure.gain)
@@ -333,7 +335,9 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     when = {"day": "by day", "dusk": "at dusk", "night": "at night"}.get(light.light, "in this light")
     if light.marker_cd_m2 < light.sky_cd_m2 and recipe.drogue.body is None:
         wanted = _rounded(1.5 * light.sky_cd_m2)
-        use = f"{wanted:,.0f} cd/m2 or a narrow-band filter" if lit else f"lamps of {wanted:,.0f} cd/m2"
+        use = f"{wanted:,.0f} cd/m2" if lit else f"lamps of {wanted:,.0f} cd/m2"
+        if recipe.sensor.band_nm is None:
+            use += " or infrared lamps and a filter (rig preset mono-850)"
         against = f"{light.marker_cd_m2:,.0f} against {light.sky_cd_m2:,.0f} cd/m2"
         yield f"{name} are darker than the sky {when}, {against}: use {use}"
     faint = [row for row in rows if row.snr < LEAST_SNR or row.contrast <= 0]

@@ -43,6 +43,8 @@ _CELLS = (4, 1)
 # Where a disc lies within one pixel of a sensor that spreads light afterwards, its image does not change with its
 # place, and only the pixel is known: the standard deviation of a place that may be anywhere in most of it. [px]
 _WITHIN_PIXEL_PX = 0.2
+# A fit that states more rests on where it began: half of what is known before it.
+_LARGEST_SIGMA_PX = 0.1
 # Lamps of one drogue differ by this share of their light, and so does the light beside them. So many are compared; one
 # with less of the usual light is hidden in part.
 _LAMPS_DIFFER, _FACES_DIFFER, _LEAST_SPREAD_DN = 0.03, 0.1, 1.0
@@ -141,11 +143,13 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
     centers = windows.middles_px + parameters[:, :2]
     moved = np.hypot(*(centers - discs.centers_px).T)
     center_cov = widen_for_nonlinearity(cov[:, :2, :2] * inflation[:, None, None])
+    sigma_px = np.sqrt(np.einsum("nii->n", center_cov) / 2)
     tests = (
         (fit.share < _LEAST_SHARE, "cut by the edge of the image, or clipped: brighter than the sensor's range"),
         (~((strength > _LEAST_STRENGTH) & (light.sum(axis=1) > 0)), "no contrast"),
         (~(moved < _LARGEST_MOVE_PX) | ~np.isfinite(center_cov).all(axis=(1, 2)), "the fit left the disc"),
         (chi2 > _LARGEST_CHI2, "uneven: not the picture of a small disc"),
+        ((discs.radii_px >= _FLAT_RADIUS_PX) & ~(sigma_px < _LARGEST_SIGMA_PX), "too faint to be placed"),
     )
     reasons = tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
     good = np.array([reason is None for reason in reasons], dtype=np.bool_)

@@ -23,6 +23,7 @@ from render.camera.image_processing import develop, metered
 from render.camera.optics import light_on_sensor
 from render.camera.sensor_readout import SensorReadout
 from render.engine import StereoRadiance
+from scenes.sky.photometry import infrared_light, infrared_weights
 
 # Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
 MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
@@ -107,14 +108,26 @@ def _sample_sites(seen: NDArray[np.float32], frame: FrameSpec) -> NDArray[np.flo
     if frame.is_monochrome:
         if camera is not None and camera.spectrum == "near-infrared":
             return near_infrared(seen)
-        mono: NDArray[np.float32] = cv2.transform(seen, MONO_WEIGHTS)
-        return mono
+        return monochrome_light(seen, frame.sensor)
     if color == "rgb" and (camera is None or camera.processing is None):
         return seen
     mosaic = np.empty(seen.shape[:2], dtype=np.float32)
     for channel, row, column in _MOSAIC_SITES:
         mosaic[row::2, column::2] = seen[row::2, column::2, channel]
     return mosaic
+
+
+def monochrome_light(light: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float32]:
+    """(H, W) light that a monochrome sensor collects of (H, W, 3) light. [cd/m2]"""
+    if sensor.band_nm is not None:
+        return infrared_light(light, sensor.band_nm)
+    mono: NDArray[np.float32] = cv2.transform(light, MONO_WEIGHTS)
+    return mono
+
+
+def mono_weights(sensor: Sensor) -> NDArray[np.float64]:
+    """(1, 3) weights of the three bands in a monochrome sensor, without what plants have beyond red."""
+    return MONO_WEIGHTS.astype(np.float64) if sensor.band_nm is None else infrared_weights(sensor.band_nm)[None]
 
 
 def near_infrared(seen: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from render.camera.sensor import MONO_WEIGHTS
+from render.camera.sensor import mono_weights
 from render.compositing import Compositor
 from render.mitsuba_engine.trace_request import DROGUE_PARTS, OPEN_TO_SKY
 from scenes.sky.photometry import REC709_LUMINANCE
@@ -78,7 +78,7 @@ class SensorNoise:
             reach = int(np.ceil(4 * sensor.psf_sigma_px))
             # The root of the kernel's energy, once for the rows and once for the columns.
             left_by_lens = float(np.sum(cv2.getGaussianKernel(2 * reach + 1, sensor.psf_sigma_px) ** 2))
-        weights = MONO_WEIGHTS.T.astype(np.float64) if sensor.color == "mono" else np.eye(3)
+        weights = mono_weights(sensor).T if sensor.color == "mono" else np.eye(3)
         return cls(
             weights=weights,
             per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),

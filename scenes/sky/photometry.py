@@ -15,6 +15,9 @@ REC709_FROM_XYZ = np.array(
 )
 CHANNEL_WAVELENGTH_UM = np.array([0.610, 0.550, 0.465])  # centroids of the Rec. 709 primaries' bands
 SOLAR_ILLUMINANCE_LUX = 127_500.0  # outside the atmosphere, IES Lighting Handbook, 9th ed., ch. 8
+_MOLECULES_EXPONENT = 4.08  # of the wavelength, in the depth of air's molecules by Preetham et al. 1999
+# Plants reflect several times as much in the near infrared: by how much they are greener than red and blue.
+_GREENNESS = 4.0
 SUN_RADIUS_RAD = np.radians(0.2666)
 SUN_SOLID_ANGLE_SR = 2 * np.pi * (1 - np.cos(SUN_RADIUS_RAD))
 # Refraction lifts sun and moon by about half a degree at the horizon (Bennett 1982, at 0 degrees).
@@ -35,6 +38,44 @@ def luminance(radiance: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     return result
 
 
+def infrared_weights(band_nm: float) -> NDArray[np.float64]:
+    """(3,) weights of red, green and blue that extrapolate light to a band beyond red, relative to sunlight there.
+
+    Linear, so that mixtures stay mixtures, and exact for what is white in sunlight and for light that molecules have
+    scattered once, whose share of sunlight falls by Rayleigh's law. Light that haze has scattered comes out up to a
+    third too bright.
+
+    Args:
+        band_nm: middle of the band. [nm]
+    """
+    red, _, blue = (1e3 * CHANNEL_WAVELENGTH_UM / band_nm) ** -_MOLECULES_EXPONENT
+    of_blue = (1.0 - red) / (blue - red)
+    return np.array([1.0 - of_blue, 0.0, of_blue])
+
+
+def infrared_light(rgb: NDArray[np.floating[Any]], band_nm: float) -> NDArray[Any]:
+    """(...) light in a band beyond red of (..., 3) light, in units of sunlight, which is as bright there as elsewhere.
+
+    Nothing falls more steeply from green on than light that molecules scatter, and plants, which alone are greener than
+    red and blue, are several times as bright.
+
+    Args:
+        rgb: linear Rec. 709. [cd/m2]
+        band_nm: middle of the band. [nm]
+    """
+    weights = infrared_weights(band_nm).astype(rgb.dtype)
+    least = rgb.dtype.type((1e-3 * band_nm / CHANNEL_WAVELENGTH_UM[1]) ** -_MOLECULES_EXPONENT)
+    red, green, blue = (rgb[..., channel] for channel in range(3))
+    greener = rgb.dtype.type(_GREENNESS) * np.maximum(green - np.maximum(red, blue), 0)
+    light: NDArray[Any] = np.maximum(weights[0] * red + weights[2] * blue, least * green) + greener
+    return light
+
+
+def light_in_band(rgb: NDArray[np.floating[Any]], band_nm: float | None) -> NDArray[Any]:
+    """(...) luminance of (..., 3) light, or `infrared_light` where a band is given. [cd/m2]"""
+    return luminance(rgb) if band_nm is None else infrared_light(rgb, band_nm)
+
+
 def hemisphere(rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Directions that cover the upper hemisphere.
 
@@ -53,7 +94,7 @@ def scattering_depth(turbidity: float) -> tuple[NDArray[np.float64], NDArray[np.
 
     Source: Preetham et al. 1999 (doi:10.1145/311535.311545), appendix A.1.
     """
-    molecules: NDArray[np.float64] = 0.008735 * CHANNEL_WAVELENGTH_UM**-4.08
+    molecules: NDArray[np.float64] = 0.008735 * CHANNEL_WAVELENGTH_UM**-_MOLECULES_EXPONENT
     aerosol: NDArray[np.float64] = (0.04608 * turbidity - 0.04586) * CHANNEL_WAVELENGTH_UM**-1.3
     return molecules, aerosol
 

@@ -13,7 +13,7 @@ from drogue_models.parameters import WHITE_PAINT
 from scenes.environment_radiance import environment_radiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.sampler import automatic_exposure, sample_frame
-from scenes.sky.photometry import luminance
+from scenes.sky.photometry import infrared_light, luminance
 from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 
 BASE: RecipeTable = {
@@ -107,3 +107,13 @@ def test_a_meter_on_the_plate_minds_no_sky_behind_it() -> None:
 def test_impossible_gains_are_refused(auto_gain: list[float]) -> None:
     with pytest.raises(ValueError, match="gain"):
         recipe(auto_gain=auto_gain)
+
+
+def test_the_meter_sees_through_the_infrared_filter() -> None:
+    frame = sample_frame(
+        build_recipe(BASE, rig={**BASE["rig"], "preset": "mono-850"}, exposure={"auto_meter": "plate"}), 0
+    )
+    ambient = environment_radiance(frame.environment)
+    plate = ambient.plate_illuminance_lux(-frame.world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
+    electrons = float(infrared_light(plate, 850.0)) * frame.sensor.electrons_per_cd_m2(frame.exposure)
+    assert electrons == pytest.approx(0.7 * frame.sensor.full_well_e, rel=1e-9)

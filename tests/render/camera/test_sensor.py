@@ -7,11 +7,12 @@ import pytest
 from scipy.special import ndtr
 
 from datasets_manifest.recipe.rigs import SENSORS
-from datasets_manifest.types.frame import Exposure, FrameSpec
+from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
 from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose
 from render.camera.sensor_readout import normal_quantiles
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sampler import sample_frame
+from scenes.sky.photometry import CHANNEL_WAVELENGTH_UM, SOLAR_ILLUMINANCE_LUX, SUN_SOLID_ANGLE_SR
 from tests.support.recipe_builder import paper_view_recipe
 
 SHAPE = (96, 128)
@@ -162,6 +163,37 @@ def test_mono_weighs_the_bands(frame: FrameSpec) -> None:
     assert images.left.ndim == 2
     expected = 4000 * MONO_WEIGHTS[0, 0] * dn_per_electron(frame.sensor, 1.0)
     assert images.left.mean() - 64 == pytest.approx(expected, rel=0.01)
+
+
+def test_filter_for_850_nm_leaves_a_tenth_of_sunlight_and_a_quarter_of_a_blue_sky(frame: FrameSpec) -> None:
+    frame = with_sensor(frame, "mono-850", read_noise_e=0.0)
+    per_electron = dn_per_electron(frame.sensor, 1.0)
+    white = expose(frame, flat_pair(level_for(frame, 4000))).left
+    assert white.ndim == 2
+    assert white.mean() - 64 == pytest.approx(4000 * per_electron, rel=0.01)
+    # Rayleigh's law from 610 to 850 nm.
+    blue = tuple((CHANNEL_WAVELENGTH_UM / 0.610) ** -4.08)
+    sky = expose(frame, flat_pair(level_for(frame, 4000), rgb=blue)).left
+    assert sky.mean() - 64 == pytest.approx(4000 * (0.850 / 0.610) ** -4.08 * per_electron, rel=0.01)
+    assert frame.sensor.responsivity_e_per_lux_s / SENSORS["mono"].responsivity_e_per_lux_s == pytest.approx(
+        0.1, abs=0.01
+    )
+
+
+def test_responsivity_behind_the_filter_is_that_to_a_black_body_like_the_sun() -> None:
+    """Planck's law at 5772 K (IAU 2015) and the sun's solid angle, instead of the table that the preset is from."""
+    wavelength_m, planck_js, light_m_s, boltzmann_j_k = 850e-9, 6.626e-34, 2.998e8, 1.381e-23
+    energy_j = planck_js * light_m_s / wavelength_m
+    radiance = 2 * energy_j * light_m_s / wavelength_m**4 / np.expm1(energy_j / (boltzmann_j_k * 5772))
+    irradiance = radiance * SUN_SOLID_ANGLE_SR * 50e-9
+    electrons = irradiance * 0.9 * 0.2 * 3.75e-6**2 / energy_j
+    # The sun's spectrum has lines there and is no black body's.
+    assert SENSORS["mono-850"].responsivity_e_per_lux_s == pytest.approx(electrons / SOLAR_ILLUMINANCE_LUX, rel=0.05)
+
+
+def test_a_band_needs_a_monochrome_sensor() -> None:
+    with pytest.raises(ValueError, match="band_nm: needs color = 'mono', got 'rgb'"):
+        Sensor.model_validate({**SENSORS["rgb-ideal"].model_dump(), "band_nm": 850.0})
 
 
 @pytest.mark.parametrize("bits", [8, 12])

@@ -6,7 +6,16 @@ import pytest
 from datasets_manifest.types.environment import CloudLayer, Environment, Moon
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import ClearSky
-from scenes.sky.photometry import REC709_FROM_XYZ, direction_from_angles, hemisphere, luminance
+from scenes.sky.photometry import (
+    CHANNEL_WAVELENGTH_UM,
+    REC709_FROM_XYZ,
+    beam_transmission,
+    direction_from_angles,
+    hemisphere,
+    infrared_light,
+    light_in_band,
+    luminance,
+)
 from scenes.sky.sky_models import moon_illuminance_lux, star_catalogue
 
 
@@ -232,3 +241,33 @@ def test_there_are_as_many_stars_as_there_are() -> None:
     assert 4500 < len(lux) < 5600
     assert 400 < np.sum(magnitude < 4) < 620
     assert 5 < np.sum(magnitude < 1) < 35
+
+
+@pytest.mark.parametrize("exponent", [0.0, 4.08])
+def test_infrared_is_exact_for_white_and_for_light_that_molecules_scatter(exponent: float) -> None:
+    light = (CHANNEL_WAVELENGTH_UM / 0.85) ** -exponent
+    assert float(infrared_light(light, 850.0)) == pytest.approx(1.0, rel=1e-12)
+    # Mixtures with white stay mixtures.
+    assert float(infrared_light(0.3 * light + 0.7, 850.0)) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_infrared_of_haze_is_at_most_a_third_too_bright() -> None:
+    for exponent in np.linspace(0.0, 4.08, 30):
+        light = float(infrared_light((CHANNEL_WAVELENGTH_UM / 0.85) ** -exponent, 850.0))
+        assert 1 - 1e-9 < light < 1.5
+
+
+def test_infrared_sunlight_at_the_ground_is_that_of_the_reference_spectrum() -> None:
+    """ASTM G173-03 at 863 nm: 0.929 of 1.012 W/m2/nm arrive from a sun at 41.8 degrees; its haze is turbidity 1.74."""
+    arrives = beam_transmission(41.8, 1.74)
+    assert float(infrared_light(arrives, 863.0)) == pytest.approx(0.929 / 1.012, rel=0.05)
+
+
+def test_infrared_sky_overhead_is_far_darker_than_the_visible_one() -> None:
+    """Against sunlight: between Rayleigh's law and that of haze, from 550 to 850 nm."""
+    sky = ClearSky(environment(turbidity=2.0, sun_elevation_deg=50.0))
+    overhead, sun = sky.radiance(np.array([0.0, 0.0, 1.0])).astype(float), sky.sun_illuminance_lux
+    share = [float(light_in_band(overhead, band) / light_in_band(sun, band)) for band in (None, 850.0)]
+    # Sunlight that has come through the air is redder.
+    assert 0.8 * (0.85 / 0.55) ** -4.08 < share[1] / share[0] < (0.85 / 0.55) ** -1.3
+    assert float(infrared_light(np.array([0.05, 0.09, 0.03]), 850.0)) > 0.2
