@@ -71,7 +71,7 @@ def refine(
     face = _face_background(layout, np.nonzero(observation.seen)[1], radius_px / layout.radius_m)
     gap_px = (smallest_gap_m(layout) / layout.radius_m - 2) * radius_px
     if radius_px < EDGELESS_RADIUS_PX or (radius_px <= LARGEST_SMALL_RADIUS_PX and gap_px < _CLOSE_PX):
-        return _refine_small(images, observation, discs, face)
+        return _refine_small(images, observation, rough, radius_px)
     is_narrow = face is not None and face.margin_px <= VISIBLE_MARGIN_PX
     if is_narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         others_weight = _balanced_weight(images, color, observation, rough, others_weight)
@@ -80,17 +80,24 @@ def refine(
     if fits.noise is None or _left_in_each_eye(observation, fits).min() < min(_LEAST_MARKERS, layout.count):
         if radius_px > LARGEST_SMALL_RADIUS_PX:
             return observation
-        small = _refine_small(images, observation, discs, face)
+        small = _refine_small(images, observation, rough, radius_px)
         return observation if isinstance(small, NoFixReason) else small
     refined = _with_markers(observation, fits)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
 
 
 def _refine_small(
-    images: StereoImages, observation: Observation, discs: Ellipses, face: FaceBackground | None
+    images: StereoImages, observation: Observation, rough: Solution, radius_px: float
 ) -> Observation | NoFixReason:
-    """Measure small markers by their blurred picture; the reason where an eye has too few that can be fitted."""
-    fits = fit_small_discs(images, discs, face)
+    """Measure small markers by their blurred picture; the reason where an eye has too few that can be fitted.
+
+    Markers that were not found are fitted too, where the pose predicts them, as their light reaches their neighbours;
+    they are not measurements.
+    """
+    whole = _with_predicted_markers(observation, rough)
+    face = _face_background(observation.layout, np.nonzero(whole.seen)[1], radius_px / observation.layout.radius_m)
+    fits = fit_small_discs(images, _initial_discs(whole, rough, radius_px), face)
+    fits = fits.take(np.flatnonzero(observation.seen[whole.seen]))
     eyes = np.nonzero(observation.seen)[0]
     for eye in np.unique(eyes):
         mine = eyes == eye
@@ -100,6 +107,18 @@ def _refine_small(
             told = f"{left} of {int(mine.sum())} small markers of the {EYES[eye]} image can be fitted"
             return NoFixReason(f"{told}; most others: {reasons.most_common(1)[0][0]}")
     return _with_markers(observation, fits)
+
+
+def _with_predicted_markers(observation: Observation, rough: Solution) -> Observation:
+    """The observation with the markers that were not found where a pose predicts them, in eyes that show any."""
+    layout, pixels = observation.layout, observation.pixels_px.copy()
+    radii_m = np.full(layout.count, layout.radius_m)
+    for side, eye in enumerate(EYES):
+        missing = ~observation.seen[side]
+        if missing.any() and not missing.all():
+            centers = disc_image_centers(observation.rig, rough.left_from_drogue, layout.centers_m, radii_m, eye)
+            pixels[side, missing] = centers[missing]
+    return replace(observation, pixels_px=pixels)
 
 
 def _initial_discs(observation: Observation, rough: Solution, radius_px: float) -> Ellipses:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,20 @@ class DiscFits:
     def accepted(self) -> NDArray[np.bool_]:
         """(M,) which discs were not rejected."""
         return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
+
+    def take(self, index: NDArray[np.int64]) -> DiscFits:
+        """Those of some discs."""
+        return replace(
+            self,
+            ellipses=self.ellipses.take(index),
+            cov_px2=self.cov_px2[index],
+            contrast_dn=self.contrast_dn[index],
+            background_dn=self.background_dn[index],
+            edge_width_px=self.edge_width_px[index],
+            chi2_per_dof=self.chi2_per_dof[index],
+            inflation=self.inflation[index],
+            reasons=tuple(self.reasons[k] for k in index),
+        )
 
 
 def unfitted_discs(discs: Ellipses) -> DiscFits:
