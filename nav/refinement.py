@@ -38,7 +38,7 @@ _LEAST_STEP_PX = 0.5
 # With fewer fitted markers, which a pose needs with one to spare, all markers stay as they were.
 _LEAST_MARKERS = 4
 # The edge model takes all light beside a disc as the background's: that of neighbours as close as this enters a window.
-_CLOSE_PX = 6.0
+_CLOSE_PX = 3.0
 # No part of the edge of smaller markers is clear of the rim's, so the other colours get the weight that removes that.
 _BALANCED_BELOW_PX = 8.0
 
