@@ -18,7 +18,7 @@ from nav.centroids.annuli import AnnulusFits, fit_annuli
 from nav.centroids.binary_centroids import smallest_gap_m
 from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.disc_fit import fit_discs
-from nav.centroids.discs import LARGEST_SCALE, DiscFits
+from nav.centroids.discs import LARGEST_SCALE, DiscFits, unfitted_discs
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
 from nav.centroids.face_background import VISIBLE_MARGIN_PX, FaceBackground
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
@@ -76,7 +76,9 @@ def refine(
     if is_narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         others_weight = _balanced_weight(images, color, observation, rough, others_weight)
     signals = marker_signals(images, color, _concatenate([discs, *_likely_hubs(observation, rough)]), others_weight)
-    fits = fit_discs(signals, discs, face)
+    # Of clipped discs this small hardly any edge is left: size and spread of their light must be known to fit them.
+    is_edgeless = radius_px <= LARGEST_SMALL_RADIUS_PX and _are_mostly_clipped(signals, discs)
+    fits = unfitted_discs(discs) if is_edgeless else fit_discs(signals, discs, face)
     if fits.noise is None or _left_in_each_eye(observation, fits).min() < min(_LEAST_MARKERS, layout.count):
         if radius_px > LARGEST_SMALL_RADIUS_PX:
             return observation
@@ -84,6 +86,16 @@ def refine(
         return observation if isinstance(small, NoFixReason) else small
     refined = _with_markers(observation, fits)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
+
+
+def _are_mostly_clipped(signals: tuple[MarkerSignal, MarkerSignal], discs: Ellipses) -> bool:
+    """Whether the middles of most discs are clipped."""
+    clipped = []
+    for eye, signal in enumerate(signals):
+        places = np.rint((discs.centers_px[discs.eyes == eye] - signal.first_px) / signal.pitch_px).astype(np.int64)
+        columns, rows = np.clip(places, 0, np.array(signal.clipped.shape[::-1]) - 1).T
+        clipped.append(signal.clipped[rows, columns])
+    return bool(np.concatenate(clipped).mean() > 0.5)
 
 
 def _refine_small(
