@@ -55,6 +55,10 @@ DatasetArgument = Annotated[
         help="The dataset's folder, or a URL such as s3://BUCKET/NAME.",
     ),
 ]
+OtherDatasetArgument = Annotated[
+    Place,
+    typer.Argument(metavar="OTHER", parser=str, callback=as_location, help="The dataset to compare it with, likewise."),
+]
 TarOption = Annotated[
     int | None,
     typer.Option(

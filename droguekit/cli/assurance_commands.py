@@ -1,4 +1,4 @@
-"""Commands that tell what datasets cover: coverage."""
+"""Commands that tell what datasets cover, and how they differ: coverage, diff."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, output_option
+from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, output_option
 from droguekit.cli.main import FAULT
 
 EXAMPLES = {
@@ -16,6 +16,11 @@ EXAMPLES = {
         "droguekit coverage data/world --html coverage.html",
         "droguekit coverage data/world --odd my-domain.toml --json coverage.json",
         "droguekit coverage data/world --estimates estimates.jsonl --detections boxes.json --html coverage.html",
+    ),
+    "diff": (
+        "droguekit diff data/world data/world-2",
+        "droguekit diff data/world s3://bucket/world --html diff.html --json diff.json",
+        "droguekit diff data/before data/after --pairs 0   (labels alone)",
     ),
 }
 
@@ -58,4 +63,38 @@ def coverage(
         write_coverage_page(found, domain, html)
         typer.echo(f"wrote {html}")
     if not found.is_complete:
+        raise typer.Exit(FAULT)
+
+
+def diff(
+    a: DatasetArgument,
+    b: OtherDatasetArgument,
+    pairs: Annotated[
+        int, typer.Option("--pairs", metavar="N", help="Compare the pixels of at most N pairs, each of another scene.")
+    ] = 24,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Write the numbers.")] = None,
+    html: Annotated[
+        Path | None, output_option("--html", "FILE", "Write one page with pictures of all laws and of some pairs.")
+    ] = None,
+) -> None:
+    """Compare two datasets: recipes, software, laws of the labels, and statistics of the pixels.
+
+    The last line tells what differs more than draws of one law do.
+
+    Exits with 1 where labels or pixels differ.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from droguekit.assurance.dataset_diff import FALSE_ALARMS, diff_datasets, diff_lines
+    from droguekit.visualization.diff_page import write_diff_page
+
+    found = diff_datasets(a, b, pairs, progress_report())
+    for line in diff_lines(found):
+        typer.echo(line)
+    if json_ is not None:
+        json_.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(json_, found.model_dump_json(indent=1) + "\n")
+    if html is not None:
+        write_diff_page(found, (a, b), html, FALSE_ALARMS)
+        typer.echo(f"wrote {html}")
+    if found.differs:
         raise typer.Exit(FAULT)

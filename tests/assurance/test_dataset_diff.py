@@ -1,0 +1,117 @@
+"""Differences between datasets: planted ones are found, and draws of one law do not differ."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from itertools import pairwise
+from pathlib import Path
+from typing import Unpack
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from droguekit.assurance import dataset_diff
+from droguekit.assurance.dataset_diff import DatasetDiff, LawDiff, diff_datasets
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
+from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, recipe_text
+from tests.support.small_datasets import rendered
+
+BASE: RecipeTable = {
+    "name": "compared",
+    "seed": 4,
+    "rig": RIG_160_PX,
+    "frames": {"count": 20, "scenes": 5, "empty_fraction": 0.1},
+    "distance": between(2.0, 6.0),
+    "environment": {"sun_elevation_deg": [20, 60], "visibility_m": [10_000, 80_000]},
+    "render": {"engine": "analytic"},
+}
+
+
+def made(folder: Path, **changes: Unpack[RecipeTable]) -> Path:
+    return rendered(recipe_text(BASE, **changes), folder)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("diff") / "base")
+
+
+def law(found: DatasetDiff, name: str) -> LawDiff:
+    return next(each for each in (*found.labels, *found.pixels) if each.name == name)
+
+
+def test_a_copy_is_the_same(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(dataset, tmp_path / "copy")
+    numbers, page = tmp_path / "diff.json", tmp_path / "diff.html"
+    command = ["diff", str(dataset), str(tmp_path / "copy"), "--json", str(numbers), "--html", str(page)]
+    assert run(command) == DONE
+    assert "the same 20 frames, and the same pixels in the 20 compared" in capsys.readouterr().out
+    found = DatasetDiff.model_validate_json(numbers.read_text())
+    assert found.recipe == () and found.manifest == () and found.same_frames == 20
+    assert all(each.p == 1.0 for each in found.pixels)
+    assert page.read_text().count("<figure>") == 8
+
+
+def test_another_seed_of_a_recipe_does_not_differ(dataset: Path, tmp_path: Path) -> None:
+    found = diff_datasets(dataset, made(tmp_path / "other", seed=5))
+    assert found.verdict == "nothing differs that draws do not explain"
+    assert [key.key for key in found.recipe] == ["seed"]
+    assert found.same_frames == 0
+    # One sky for all pairs of a scene; a distance for each that has a drogue.
+    assert law(found, "sun_elevation_deg").units == "scenes" and law(found, "sun_elevation_deg").counts == (5, 5)
+    assert law(found, "distance_m").units == "pairs" and 30 <= sum(law(found, "distance_m").counts) < 40
+
+
+@pytest.mark.slow
+def test_twenty_pairs_of_seeds_do_not_differ(tmp_path: Path) -> None:
+    folders = [made(tmp_path / str(seed), seed=seed) for seed in range(100, 121)]
+    verdicts = [diff_datasets(a, b).verdict for a, b in pairwise(folders)]
+    assert verdicts == ["nothing differs that draws do not explain"] * 20
+
+
+def test_a_shifted_law_of_distances_is_found(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = made(tmp_path / "other", seed=5, distance=between(8.0, 12.0))
+    assert run(["diff", str(dataset), str(other)]) == FAULT
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    assert last.startswith("labels differ in") and "distance_m" in last and "sun_elevation_deg" not in last
+    found = diff_datasets(dataset, other, pairs=0)
+    assert {key.key for key in found.recipe} == {"seed", "distance.low_m", "distance.high_m"}
+    assert law(found, "distance_m").distance == 1.0
+    assert found.pixels == ()
+
+
+def test_another_encoding_is_found_on_the_same_frames(dataset: Path, tmp_path: Path) -> None:
+    found = diff_datasets(dataset, made(tmp_path / "other", rig=RIG_160_PX | {"encoding": "gamma"}))
+    assert not any(each.differs for each in found.labels) and found.same_frames == 20 and found.same_pixels == 0
+    # Encoded levels are higher in every pair.
+    assert law(found, "mean_level").distance == 0.5
+    assert law(found, "mean_level").differs and law(found, "noise").differs
+    assert found.verdict.startswith("pixels differ in mean_level")
+
+
+def test_chances_of_words_are_those_of_fisher() -> None:
+    words = ["sea"] * 9 + ["town"] * 3, ["sea"] * 3 + ["town"] * 9
+    found = dataset_diff._word_law("ground", "scenes", words, 1e-3)
+    exact = stats.fisher_exact([[9, 3], [3, 9]]).pvalue
+    # Four standard errors of a share of 9,999 draws.
+    assert found.p == pytest.approx(exact, abs=4 * np.sqrt(exact / 9_999))
+    assert found.distance == pytest.approx(0.5)
+
+
+def test_too_few_scenes_tell_nothing(dataset: Path, tmp_path: Path) -> None:
+    one = made(tmp_path / "one", frames={"count": 6, "scenes": 1})
+    found = diff_datasets(one, made(tmp_path / "two", seed=9, frames={"count": 6, "scenes": 1}))
+    assert law(found, "family").p == 1.0 and law(found, "mean_level").p == 1.0
+
+
+def test_wrong_input_is_named(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["diff", str(dataset), str(tmp_path / "none")]) == WRONG_INPUT
+    assert "none" in capsys.readouterr().err
+    assert run(["diff", str(dataset), str(dataset), "--pairs", "-1"]) == WRONG_INPUT
+    assert "--pairs: must not be negative, got -1" in capsys.readouterr().err
+    shutil.copytree(dataset, tmp_path / "damaged")
+    record = next((tmp_path / "damaged" / "frames").glob("*/record.json"))
+    record.write_text(json.dumps({}))
+    assert run(["diff", str(dataset), str(tmp_path / "damaged")]) == WRONG_INPUT
