@@ -39,6 +39,8 @@ _LEAST_STEP_PX = 0.5
 _LEAST_MARKERS = 4
 # The edge model takes all light beside a disc as the background's: that of neighbours as close as this enters a window.
 _CLOSE_PX = 3.0
+# Standard deviation of a centre up to which it is a measurement without a fit. [px]
+_LARGEST_SIGMA_PX = 0.2
 # No part of the edge of smaller markers is clear of the rim's, so the other colours get the weight that removes that.
 _BALANCED_BELOW_PX = 8.0
 
@@ -83,9 +85,15 @@ def refine(
         if radius_px > LARGEST_SMALL_RADIUS_PX:
             return observation
         small = _refine_small(images, observation, rough, radius_px)
-        return observation if isinstance(small, NoFixReason) else small
+        return observation if isinstance(small, NoFixReason) and _are_placed(observation) else small
     refined = _with_markers(observation, fits)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
+
+
+def _are_placed(observation: Observation) -> bool:
+    """Whether markers are known well enough without a fit; peaks of light, which any light beside moves, are not."""
+    variances = np.einsum("enii->en", observation.cov_px2)[observation.seen] / 2
+    return bool(np.median(variances) < _LARGEST_SIGMA_PX**2)
 
 
 def _are_mostly_clipped(signals: tuple[MarkerSignal, MarkerSignal], discs: Ellipses) -> bool:

@@ -118,7 +118,8 @@ def test_from_recipe_to_benchmark_without_a_fault(
     ring_m = float(np.hypot(*read.drogue.marker_positions_m[0]))
     gap_px = radius_px / read.drogue.marker_radius_m * 2 * ring_m * np.sin(np.pi / read.drogue.marker_count)
     is_apart = gap_px - 2 * radius_px > 3
-    if radius_px >= 1 and read.drogue.marker_count >= 4 and is_apart and pooled is not None:
-        # Twelve errors: their root mean square is right to a fifth. Centres of one pair err together where light of the
-        # sky reaches them or where clipped markers keep their binary centres; a wrong match is off by far more.
-        assert pooled < 2.5
+    is_measured = radius_px >= 1 and read.drogue.marker_count >= 4 and is_apart
+    if is_measured and row["fix_fraction"] >= 0.5 and pooled is not None:
+        # Six to twelve errors know their root mean square to 20 to 30 %: of sets with a true ratio of 1.2 one in forty
+        # is above 1.75. A wrong match is off by far more. studies/acceptance/RESULTS.md has the ratios.
+        assert pooled < 2.0
