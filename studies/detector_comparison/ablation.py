@@ -72,12 +72,24 @@ PARTS: dict[str, dict[str, Any]] = {
     "no-mosaic": {"mosaic": False},
     ONE_VIEW: {"views": "one"},
 }
-# What droguekit 0.2 trained with, whose 1,500 passes of warm-up were this share of 5,184, and one step of it at a time.
-FORMER: dict[str, Any] = {"warmup_fraction": 0.289}
-# How the network learns: one setting changed at a time, beside what we ship and what was before.
+# How the network learns: one setting changed at a time, first the warm-up of 1,500 passes in a training of 5,184.
 LEARNING: dict[str, dict[str, Any]] = {
     "eca-asff": {},
-    "former": FORMER,
+    "long-warm-up": {"warmup_fraction": 0.289},
+    "asff-equal": {"fusion_start": "equal"},
+    "asff-own": {"fusion_start": "own"},
+    "muon": {"optimizer": "muon", "learning_rate": 4e-3},
+    "sgd": {"optimizer": "sgd", "learning_rate": 2e-2, "weight_decay": 5e-4},
+    "rate-half": {"learning_rate": 1e-3},
+    "rate-double": {"learning_rate": 4e-3},
+    "short-average": {"ema_decay": 0.95},
+    "small-batch": {"batch_images": 4},
+    "more-cells": {"cells_per_box": 20},
+    "cross-entropy": {"focus_power": 0.0},
+    "box-weight": {"box_weight": 7.5},
+    "own-box-weight": {"fusion_start": "own", "box_weight": 7.5},
+    "low-prior": {"prior_score": 1e-3},
+    "all-mosaic": {"mosaic_fraction": 1.0},
 }
 CHANGES = PARTS | LEARNING
 _INTERRUPTED = 130
@@ -269,7 +281,7 @@ def main(
     seed: SeedOption = 0,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of trainings of each, from --seed on.")] = 1,
     network: Annotated[
-        list[str] | None, typer.Option("--network", metavar="NAME", help="One of those below. Repeatable.")
+        list[str] | None, typer.Option("--network", metavar="NAME", help=f"Of {', '.join(CHANGES)}. Repeatable.")
     ] = None,
     learning: Annotated[bool, typer.Option("--learning", help="How our network learns, not what it is.")] = False,
     device: DeviceOption = "cpu",
