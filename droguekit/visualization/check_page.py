@@ -45,7 +45,12 @@ class DroguePicture:
 
 
 def write_check_page(
-    name: str, rows: Sequence[Prediction], pictures: Sequence[DroguePicture], lines: Sequence[str], out: Path
+    name: str,
+    rows: Sequence[Prediction],
+    pictures: Sequence[DroguePicture],
+    lines: Sequence[str],
+    out: Path,
+    advice: Sequence[str] = (),
 ) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
@@ -55,6 +60,7 @@ def write_check_page(
         pictures: rendered ones, from near to far; may be none.
         lines: printed by the command.
         out: file to write.
+        advice: what will fail, told at the top, as a narrow screen cuts long lines.
 
     Raises:
         OSError: it cannot be written.
@@ -63,6 +69,8 @@ def write_check_page(
         "Computed from the recipe's light, exposure and sensor, with the drogue on the cameras' axis. "
         "The pictures are rendered, and stretched to their brightest parts."
     )
+    if advice:
+        description += " What will fail, and what to change: " + "; ".join(advice) + "."
     write_figure_page(f"What to expect of {name}", description, _figures(rows, pictures), lines, out)
 
 

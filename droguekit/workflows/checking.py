@@ -50,7 +50,7 @@ def checked_lines(
         distances = [row.distance_m for row in check.of_light(check.lights[0].light)]
         chosen = dict.fromkeys((distances[0], distances[len(distances) // 2], distances[-1]))
         pictures = [_picture(recipe, distance_m) for distance_m in chosen]
-        write_check_page(recipe.name, check.markers, pictures, lines, html_out)
+        write_check_page(recipe.name, check.markers, pictures, lines, html_out, check.advice)
         yield f"wrote {html_out}"
 
 
