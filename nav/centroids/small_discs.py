@@ -47,14 +47,12 @@ _WITHIN_PIXEL_PX = 0.2
 _LARGEST_SIGMA_PX = 0.1
 # Lamps of one drogue differ by this share of their light, and so does the light beside them. So many are compared; one
 # with less of the usual light is hidden in part.
-_LAMPS_DIFFER, _FACES_DIFFER, _LEAST_SPREAD_DN = 0.03, 0.1, 1.0
-_LEAST_ALIKE, _LEAST_LIGHT = 4, 0.5
+_LAMPS_DIFFER, _FACES_DIFFER, _LEAST_SPREAD_DN, _LEAST_ALIKE, _LEAST_LIGHT = 0.03, 0.1, 1.0, 4, 0.5
 # Shorter images of a round face are no images of one; drogues tilt by some ten degrees.
 _LEAST_ASPECT = 0.8
-# The light of a neighbour over the own one; beyond, one of both is no lamp.
-_LARGEST_RATIO = 3.0
-# An own light of fewer standard deviations may be noise.
-_LEAST_STRENGTH = 4.0
+# The light of a neighbour over the own one; beyond, one of both is no lamp. An own light of fewer standard deviations
+# may be noise.
+_LARGEST_RATIO, _LEAST_STRENGTH = 3.0, 4.0
 # Of a disc's light this share must lie in pixels that are used; clipped ones are not.
 _LEAST_SHARE = 0.05
 _LARGEST_MOVE_PX = 1.0
