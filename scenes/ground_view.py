@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
-from geometry.bilinear_sampling import sample_bilinear
+from geometry.compiled_loops import compiled
 
 Field = NDArray[np.float32]
 _SMALLEST_LEVEL_PX = 8
@@ -67,15 +67,18 @@ class MipTile:
     """
 
     def __init__(self, texels: Field, texel_m: float, coded: bool = False) -> None:
-        self._texel_m = texel_m
-        self._levels: list[NDArray[np.float32] | NDArray[np.uint8]] = []
-        level = texels
+        self._texel_m, self._side, self._channels = texel_m, texels.shape[0], texels.shape[2]
+        levels, level = [], texels
         while True:
-            keep = coded and len(self._levels) < _BYTE_LEVELS
-            self._levels.append(np.rint(255 * np.sqrt(np.clip(level, 0, 1))).astype(np.uint8) if keep else level)
+            levels.append(level.ravel())
             if level.shape[0] <= _SMALLEST_LEVEL_PX:
                 break
-            level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            smaller = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            level = smaller.reshape(*smaller.shape[:2], self._channels)
+        self._top, self._byte_levels = len(levels) - 1, _BYTE_LEVELS if coded else 0
+        roots = [np.rint(255 * np.sqrt(np.clip(level, 0, 1))).astype(np.uint8) for level in levels[: self._byte_levels]]
+        self._roots = np.concatenate([*roots, np.zeros(0, np.uint8)])
+        self._values = np.concatenate([*levels[self._byte_levels :], np.zeros(0, np.float32)])
         self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
         self.most = float(texels[..., 0].max())
 
@@ -89,38 +92,108 @@ class MipTile:
         Returns:
             (H, W, C) values.
         """
-        top = len(self._levels) - 1
-        height = np.clip(np.log2(np.maximum(footprint_m, 1e-3) / np.float32(self._texel_m)), 0, top).astype(np.float32)
-        first = int(height.min())
-        last = min(top, int(np.ceil(height.max())))
-        # remap wraps only by its border mode and has 16-bit coordinates: reduce to one repeat first.
-        size, per_m = np.float32(self._levels[0].shape[0]), np.float32(1.0 / self._texel_m)
-        u, v = x_m * per_m, y_m * per_m
-        u -= np.floor(u / size) * size
-        v -= np.floor(v / size) * size
-        if first == last:
-            return self._at_level(first, u, v)
-        total: Field | None = None
-        for level in range(first, last + 1):
-            weight = np.maximum(1.0 - np.abs(height - np.float32(level)), np.float32(0.0))
-            part = self._at_level(level, u, v)
-            part *= weight[..., None]
-            total = part if total is None else total + part
-        assert total is not None
-        return total
+        zero = np.zeros(1, np.float32)
+        return self.sample_along((x_m, y_m), (zero, zero), footprint_m, 1)
 
-    def _at_level(self, level: int, u: Field, v: Field) -> Field:
-        """(H, W, C) values of one level at positions in texels of the finest level, within one repeat."""
-        picture = self._levels[level]
-        scale, half = np.float32(0.5**level), np.float32(0.5)
-        seen = sample_bilinear(picture, u * scale - half, v * scale - half, cv2.BORDER_WRAP)
-        seen = seen.reshape(*u.shape, -1)
-        if picture.dtype == np.uint8:
-            root: Field = seen.astype(np.float32)
-            root *= np.float32(1 / 255)
-            root *= root
-            return root
-        return np.asarray(seen, dtype=np.float32)
+    def sample_along(
+        self, middle_m: tuple[Field, Field], along_m: tuple[Field, Field], width_m: Field, places: int
+    ) -> Field:
+        """Means of the values at places on lines.
+
+        Args:
+            middle_m: (H, W) x and y of the lines' middles. [m]
+            along_m: x and y from end to end, (H, W), or (1,) where all are the same. [m]
+            width_m: (H, W) width to average over at each place. [m]
+            places: number of places on each line.
+
+        Returns:
+            (H, W, C) values.
+        """
+        shape = np.broadcast_shapes(middle_m[0].shape, width_m.shape)
+        flat = [
+            np.ascontiguousarray(part if part.size == 1 else np.broadcast_to(part, shape), dtype=np.float32).ravel()
+            for part in (*middle_m, *along_m, width_m)
+        ]
+        total = np.zeros((int(np.prod(shape)), self._channels), dtype=np.float32)
+        sizes = self._side, self._top, self._byte_levels
+        _add_samples(self._roots, self._values, sizes, self._texel_m, *flat, places, total)
+        return total.reshape(*shape, self._channels)
+
+
+@compiled
+def _add_level(
+    texels: NDArray[np.uint8] | NDArray[np.float32],
+    start: int,
+    side: int,
+    place: tuple[float, float],
+    weight: float,
+    sums: NDArray[np.float32],
+    index: int,
+) -> None:
+    """Add to `sums[index]` what a level has at a place in its texels; bytes are roots of 255 times 255 the value."""
+    across, down = np.floor(place[0]), np.floor(place[1])
+    a, b = np.float32(place[0] - across), np.float32(place[1] - down)
+    left, top, channels = int(across) & (side - 1), int(down) & (side - 1), sums.shape[1]
+    right, below = (left + 1) & (side - 1), (top + 1) & (side - 1)
+    top, below = start + top * side * channels, start + below * side * channels
+    left, right = left * channels, right * channels
+    for c in range(channels):
+        upper = texels[top + left + c] * (np.float32(1.0) - a) + texels[top + right + c] * a
+        lower = texels[below + left + c] * (np.float32(1.0) - a) + texels[below + right + c] * a
+        value = upper + b * (lower - upper)
+        if texels.itemsize == 1:
+            value *= np.float32(1.0 / 255.0)
+            value *= value
+        sums[index, c] += np.float32(weight) * value
+
+
+@compiled
+def _add_samples(
+    roots: NDArray[np.uint8],
+    values: NDArray[np.float32],
+    sizes: tuple[int, int, int],
+    texel_m: float,
+    x_m: Field,
+    y_m: Field,
+    along_x_m: Field,
+    along_y_m: Field,
+    width_m: Field,
+    places: int,
+    sums: Field,
+) -> None:
+    """Add the means at places on lines; see `MipTile.sample_along`.
+
+    Args:
+        roots, values: the levels one after the other: those of bytes, the others.
+        sizes: of the finest level, number of the coarsest level, and how many levels are of bytes.
+        texel_m: of the finest level. [m]
+        x_m, y_m, along_x_m, along_y_m, width_m: (N,), or (1,) where all are the same.
+        places: on each line.
+        sums: (N, C).
+    """
+    side, top, byte_levels = sizes
+    channels = sums.shape[1]
+    for index in range(sums.shape[0]):
+        width = float(width_m[index if width_m.size > 1 else 0])
+        x, y = float(x_m[index if x_m.size > 1 else 0]), float(y_m[index if y_m.size > 1 else 0])
+        along = index if along_x_m.size > 1 else 0
+        level = min(max(np.log2(max(width, 1e-3) / texel_m), 0.0), float(top))
+        for place in range(places):
+            step = (place + 0.5) / places - 0.5
+            u, v = (x + step * along_x_m[along]) / texel_m, (y + step * along_y_m[along]) / texel_m
+            for which in range(2):
+                number = int(level) + which
+                weight = (1.0 - abs(level - number)) / places
+                if weight <= 0.0:
+                    continue
+                start, scale = 0, 0.5**number
+                for finer in range(0 if number < byte_levels else byte_levels, number):
+                    start += (side >> finer) * (side >> finer) * channels
+                at = u * scale - 0.5, v * scale - 0.5
+                if number < byte_levels:
+                    _add_level(roots, start, side >> number, at, weight, sums, index)
+                else:
+                    _add_level(values, start, side >> number, at, weight, sums, index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,17 +233,8 @@ class GroundView:
             du, dv = axes.turned(du, dv)
             u, v = u + axes.shift_u_m, v + axes.shift_v_m
         width_m = np.maximum(self.across_m, self.along_m / np.float32(self.places))
-        totals: list[Field] = []
-        for place in range(self.places):
-            step_m = np.float32((place + 0.5) / self.places - 0.5) * self.along_m
-            at = u + step_m * du, v + step_m * dv
-            for index, tile in enumerate(tiles):
-                part = tile.sample(*at, width_m)
-                if place == 0:
-                    totals.append(part)
-                else:
-                    totals[index] += part
-        return [total / np.float32(self.places) for total in totals]
+        along_m = self.along_m * du, self.along_m * dv
+        return [tile.sample_along((u, v), along_m, width_m, self.places) for tile in tiles]
 
 
 @dataclass(frozen=True, eq=False)

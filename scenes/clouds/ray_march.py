@@ -258,7 +258,7 @@ def march_rays(
                 pz + sun[2] * middle_m,
                 max(2.0 * detail_m, 0.5 * step_m),
             )
-            soft_m = max(softness_m, 0.5 * step_m)
+            soft_m = max(5.0 * softness_m, 0.5 * step_m)
             towards += min(max(inner / soft_m, 0.0), 1.0) * extinction * step_m
             way_m += step_m
             step_m *= 2.6

@@ -16,6 +16,7 @@ from datasets_manifest.types.environment import GROUND_KINDS, Environment, SkyMo
 from scenes.atmosphere.air_layers import horizon_dip_rad
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
+from studies.realism.blind_test import make_test, score
 from studies.realism.cloud_measures import cloud_table
 from studies.realism.ground_measures import ground_table
 from studies.realism.scene_variety import variety_table
@@ -167,8 +168,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     variety = parts.add_parser("variety", help="how many scenes of recipes look different")
     variety.add_argument("recipes", nargs="+", metavar="RECIPE", help="name of a recipe, or a .toml file")
     variety.add_argument("--family", nargs="+", metavar="NAME", default=(), help="of these families alone")
+    blind = parts.add_parser("blind-test", help="mix pictures of ours and photographs for judges who do not know which")
+    blind.add_argument("recipe", metavar="RECIPE", help="name of a recipe, or a .toml file")
+    blind.add_argument("--photographs", nargs="+", type=Path, required=True, help="of sky, clouds and land")
+    blind.add_argument("--count", type=int, default=24, help="of either kind (default: 24)")
+    blind.add_argument("--seed", type=int, default=1, help="of windows and order (default: 1)")
+    blind.add_argument("--out", type=Path, required=True, help="a new folder")
+    judged = parts.add_parser("blind-score", help="which share judges took for photographs")
+    judged.add_argument("key", type=Path, help="key.json of the test")
+    judged.add_argument("answers", nargs="+", type=Path, help="CSV files: number,answer (photograph or render)")
     given = parser.parse_args(arguments)
-    if given.part == "sky":
+    if given.part == "blind-test":
+        make_test(load_recipe(given.recipe).recipe, given.photographs, given.count, given.out, given.seed)
+    elif given.part == "blind-score":
+        print(score(given.key, given.answers))
+    elif given.part == "sky":
         print(sky_table())
     elif given.part == "clouds":
         print(cloud_table(given.photographs))
