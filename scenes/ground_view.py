@@ -110,13 +110,13 @@ class MipTile:
             (H, W, C) values.
         """
         shape = np.broadcast_shapes(middle_m[0].shape, width_m.shape)
-        flat = [
+        x_m, y_m, along_x_m, along_y_m, width_m = (
             np.ascontiguousarray(part if part.size == 1 else np.broadcast_to(part, shape), dtype=np.float32).ravel()
             for part in (*middle_m, *along_m, width_m)
-        ]
+        )
         total = np.zeros((int(np.prod(shape)), self._channels), dtype=np.float32)
-        sizes = self._side, self._top, self._byte_levels
-        _add_samples(self._roots, self._values, sizes, self._texel_m, *flat, places, total)
+        sizes, lines = (self._side, self._top, self._byte_levels), (x_m, y_m, along_x_m, along_y_m, width_m)
+        _add_samples(self._roots, self._values, sizes, self._texel_m, lines, places, total)
         return total.reshape(*shape, self._channels)
 
 
@@ -153,11 +153,7 @@ def _add_samples(
     values: NDArray[np.float32],
     sizes: tuple[int, int, int],
     texel_m: float,
-    x_m: Field,
-    y_m: Field,
-    along_x_m: Field,
-    along_y_m: Field,
-    width_m: Field,
+    lines: tuple[Field, Field, Field, Field, Field],
     places: int,
     sums: Field,
 ) -> None:
@@ -167,11 +163,13 @@ def _add_samples(
         roots, values: the levels one after the other: those of bytes, the others.
         sizes: of the finest level, number of the coarsest level, and how many levels are of bytes.
         texel_m: of the finest level. [m]
-        x_m, y_m, along_x_m, along_y_m, width_m: (N,), or (1,) where all are the same.
+        lines: x and y of their middles, x and y from end to end, and width to average over: (N,), or (1,) where all are
+            the same. [m]
         places: on each line.
         sums: (N, C).
     """
     side, top, byte_levels = sizes
+    x_m, y_m, along_x_m, along_y_m, width_m = lines
     channels = sums.shape[1]
     for index in range(sums.shape[0]):
         width = float(width_m[index if width_m.size > 1 else 0])
