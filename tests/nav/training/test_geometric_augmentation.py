@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import PADDING_DN, input_image, network_input
 from nav.training.augmentation import (
@@ -147,7 +148,9 @@ def test_validation_uses_the_detectors_input() -> None:
     in_use, place = input_image(stereo, "left", (416, 320))
     assert place.offset_px == (0, 4)  # a reduction by 1.54, and margins
     pairs = (CachedPair(frame_index=0, split="val", boxes=((31.0, 50.0, 100.0, 81.0), None)),)
-    corpus = Corpus((), (480, 640), (ImageCache(np.stack([picture, picture])[None], pairs),), np.array([[0, 0]]))
+    corpus = Corpus(
+        (), (480, 640), (ImageCache(np.stack([picture, picture])[None], pairs, PairFaults()),), np.array([[0, 0]])
+    )
     image, boxes = whole_image(corpus, 0, 0, (320, 416))
     given = to_tensor(image[None], ComputeDevice(torch.device("cpu"), bf16=False))
     np.testing.assert_allclose(given.numpy(), network_input([in_use]), atol=1e-7)  # division or product in float32

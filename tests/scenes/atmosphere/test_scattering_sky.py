@@ -250,9 +250,10 @@ def test_an_overcast_leaves_no_gap_above_the_ground() -> None:
         texture_seed=1,
     )
     around = EnvironmentRadiance(environment(altitude_m=1000.0, visibility_m=25_000.0, clouds=(deck,)))
-    light = luminance(around.radiance(column(-1.5, 3.0)))[:, 1]
+    # So low that the air hides the mottle of the deck.
+    light = luminance(around.radiance(column(-1.5, 0.5)))[:, 1]
     # The clear sky there is five times as bright as the air under the deck.
-    assert light.max() < 1.3 * light[0]
+    assert light.max() < 1.1 * np.median(light)
 
 
 def test_a_deck_below_ends_at_a_horizon_of_its_own() -> None:
