@@ -112,7 +112,7 @@ def test_the_command_writes_numbers_and_one_page(tmp_path: Path, capsys: pytest.
     text = page.read_text()
     assert text.count("data:image/png;base64,") == 9
     assert "What to expect of mine" in text
-    assert "http" not in text
+    assert "http:" not in text and "https:" not in text
 
 
 def test_a_drogue_without_markers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
