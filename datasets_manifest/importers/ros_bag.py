@@ -263,7 +263,9 @@ class _BagReader:
         try:
             store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
             self.deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-            self.connections = [each for each in self._reader.connections if each.msgtype in _READ_TYPES]
+            # Databases give their topics in no certain order; errors name the first by name.
+            known = [each for each in self._reader.connections if each.msgtype in _READ_TYPES]
+            self.connections = sorted(known, key=lambda connection: connection.topic)
             for kind in _READ_TYPES:
                 text, digest = store.generate_msgdef(kind, ros_version=1 if is_ros1 else 2)
                 digest = digest if is_ros1 else store.hash_rihs01(kind)

@@ -9,37 +9,31 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import stats
 
-from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
 from droguekit.assurance.design_domain import NUMBERS, WORDS
+from droguekit.assurance.law_comparison import LawDiff, Units, compare_changes, compare_numbers, compare_words
 from droguekit.batch.progress import PlainProgress, ProgressReport
 
 FALSE_ALARMS = 0.005
 """Chance that two datasets of one law differ in any row; shared evenly between the rows (Bonferroni)."""
 # Below this scenes are said to sway a number.
 _SWAYED = 0.01
-_PERMUTATIONS = 9_999
-_FEWEST = 4
 _MOST_SHOWN, _MOST_TEXT = 12, 120
 # Of a frame: how light becomes pixels.
 _PIPELINE = {"sensor", "camera"}
-
-Units = Literal["pairs", "scenes", "sequences", "pairs of the same frames"]
 
 
 class KeyDiff(FrozenModel):
@@ -48,33 +42,6 @@ class KeyDiff(FrozenModel):
     key: str
     a: str
     b: str
-
-
-class LawDiff(FrozenModel):
-    """One quantity of both datasets.
-
-    Attributes:
-        name: with its unit.
-        units: what counts once.
-        counts: of A and of B.
-        typical: median of a number, commonest word.
-        distance: largest difference of the cumulative shares of a number (Kolmogorov and Smirnov), half the sum of the
-            differences of the shares of words; of the same frames the share of pairs in which B is larger, less a half.
-        p: chance of such a distance, or a larger one, by draws alone; 1 where there are too few to tell.
-        differs: whether that is too unlikely.
-        shares: of A and of B, in 24 equal parts of their common range, or for each word; for pictures.
-        ends: of that range, or the words.
-    """
-
-    name: str
-    units: Units
-    counts: tuple[int, int]
-    typical: tuple[str, str]
-    distance: float
-    p: float
-    differs: bool
-    shares: tuple[tuple[float, ...], tuple[float, ...]]
-    ends: tuple[str, ...]
 
 
 class DatasetDiff(FrozenModel):
@@ -98,7 +65,7 @@ class DatasetDiff(FrozenModel):
     recipe: tuple[KeyDiff, ...]
     manifest: tuple[KeyDiff, ...]
     labels: tuple[LawDiff, ...]
-    pixels: tuple[LawDiff, ...] = Field(default=())
+    pixels: tuple[LawDiff, ...]
 
     @property
     def differs(self) -> bool:
@@ -116,10 +83,20 @@ class DatasetDiff(FrozenModel):
         if laws:
             return "; ".join(laws)
         if self.same_frames == self.pairs[0] == self.pairs[1]:
-            if self.same_pixels == self.compared[0]:
-                return f"the same {self.pairs[0]} frames, and the same pixels in the {self.compared[0]} compared"
-            return f"the same {self.pairs[0]} frames; pixels differ in value, not in law"
+            of_pixels = (
+                "pixels were not compared"
+                if not self.compared[0]
+                else f"the same pixels in the {self.compared[0]} compared"
+                if self.same_pixels == self.compared[0]
+                else "pixels differ in value, not in law"
+            )
+            return f"the same {self.pairs[0]} frames; {of_pixels}"
         return "nothing differs that draws do not explain"
+
+    @property
+    def untold(self) -> tuple[str, ...]:
+        """Laws of which there are too few draws for any difference to be told."""
+        return tuple(law.name for law in (*self.labels, *self.pixels) if not law.can_differ)
 
 
 class _Drawn(NamedTuple):
@@ -136,9 +113,15 @@ class _Group(NamedTuple):
     sequence_id: int | None
 
 
-class _Labels(NamedTuple):
-    """Labels of a dataset, by name and group."""
+class _Read(NamedTuple):
+    """What a dataset's records say.
 
+    Attributes:
+        drawn: by frame.
+        numbers, words: labels by name and group.
+    """
+
+    drawn: dict[int, _Drawn]
     numbers: dict[str, dict[_Group, list[float]]]
     words: dict[str, dict[_Group, list[str]]]
 
@@ -157,51 +140,46 @@ def diff_datasets(a: Location, b: Location, pairs: int = 24, report: ProgressRep
     if pairs < 0:
         raise ValueError(f"--pairs: must not be negative, got {pairs}")
     sources = Dataset(a), Dataset(b)
-    shown = PlainProgress(io.StringIO()) if report is None else report
-    records, labels = [], []
-    for source in sources:
-        found: dict[int, _Drawn] = {}
-        own = _Labels(defaultdict(lambda: defaultdict(list)), defaultdict(lambda: defaultdict(list)))
-        shown.begin("pairs", len(source.frame_indices))
-        try:
-            for index in source.frame_indices:
-                record = source.record(index)
-                found[index] = _Drawn(
-                    record.scene_id, _digest(record.frame.model_dump_json(exclude=_PIPELINE).encode())
-                )
-                _add_labels(own, record)
-                shown.advance()
-        finally:
-            shown.end()
-        records.append(found)
-        labels.append(own)
-    first, second = records
-    common = [k for k in first if k in second and first[k] == second[k]]
-    are_same = 0 < len(common) == len(first) == len(second)
-    chosen = (
-        ([common[k] for k in np.unique(np.linspace(0, len(common) - 1, pairs).astype(int))],) * 2
-        if are_same
-        else (_spread(list(first), first, pairs), _spread(list(second), second, pairs))
-    )
+    first, second = (_read(source, report) for source in sources)
+    common = [k for k, drawn in first.drawn.items() if second.drawn.get(k) == drawn]
+    are_same = 0 < len(common) == len(first.drawn) == len(second.drawn)
+    chosen = [_evenly(common, pairs) if are_same else _of_each_scene(read.drawn, pairs) for read in (first, second)]
     measured = [_measure(source, which) for source, which in zip(sources, chosen, strict=True)]
-    rows = len(NUMBERS) + len(WORDS) + 1 + len(PIXEL_MEASURES)
-    most_p = FALSE_ALARMS / rows
+    most_p = FALSE_ALARMS / (len(NUMBERS) + len(WORDS) + 1 + len(PIXEL_MEASURES))
     manifests = sources[0].manifest, sources[1].manifest
     return DatasetDiff(
         names=(manifests[0].name, manifests[1].name),
         sha256=(manifests[0].dataset_sha256, manifests[1].dataset_sha256),
-        pairs=(len(first), len(second)),
+        pairs=(len(first.drawn), len(second.drawn)),
         same_frames=len(common),
         same_pixels=sum(x.digest == y.digest for x, y in zip(*measured, strict=True)) if are_same else 0,
         compared=(len(chosen[0]), len(chosen[1])),
-        recipe=tuple(_key_diffs(_recipe_table(manifests[0].recipe), _recipe_table(manifests[1].recipe))),
+        recipe=tuple(
+            _key_diffs(manifests[0].recipe.model_dump(mode="json"), manifests[1].recipe.model_dump(mode="json"))
+        ),
         manifest=tuple(_key_diffs(_manifest_table(manifests[0]), _manifest_table(manifests[1]))),
-        labels=tuple(_label_laws(labels[0], labels[1], most_p)),
+        labels=tuple(_label_laws(first, second, most_p)),
         pixels=tuple(_pixel_laws(measured[0], measured[1], are_same, most_p)) if pairs else (),
     )
 
 
-def _add_labels(labels: _Labels, record: PairRecord) -> None:
+def _read(source: Dataset, report: ProgressReport | None) -> _Read:
+    read = _Read({}, defaultdict(lambda: defaultdict(list)), defaultdict(lambda: defaultdict(list)))
+    shown = PlainProgress(io.StringIO()) if report is None else report
+    shown.begin("pairs", len(source.frame_indices))
+    try:
+        for index in source.frame_indices:
+            record = source.record(index)
+            digest = _digest(record.frame.model_dump_json(exclude=_PIPELINE).encode())
+            read.drawn[index] = _Drawn(record.scene_id, digest)
+            _add_labels(read, record)
+            shown.advance()
+    finally:
+        shown.end()
+    return read
+
+
+def _add_labels(labels: _Read, record: PairRecord) -> None:
     group = _Group(record.scene_id, record.sequence_id)
     labels.numbers["empty_fraction"][group].append(float(record.left_from_drogue is None))
     for name, number_of in NUMBERS.items():
@@ -212,7 +190,7 @@ def _add_labels(labels: _Labels, record: PairRecord) -> None:
             labels.words[name][group].append(word)
 
 
-def _label_laws(a: _Labels, b: _Labels, most_p: float) -> Iterator[LawDiff]:
+def _label_laws(a: _Read, b: _Read, most_p: float) -> Iterator[LawDiff]:
     for name in sorted(a.numbers.keys() | b.numbers.keys()):
         sides = a.numbers.get(name, {}), b.numbers.get(name, {})
         is_grouped = any(_is_swayed(side) for side in sides)
@@ -223,11 +201,11 @@ def _label_laws(a: _Labels, b: _Labels, most_p: float) -> Iterator[LawDiff]:
             for side in sides
         ]
         units: Units = _groups_name(sides) if is_grouped else "pairs"
-        yield _number_law(name, units, (values[0], values[1]), most_p)
+        yield compare_numbers(name, units, (values[0], values[1]), most_p)
     for name in sorted(a.words.keys() | b.words.keys()):
         sides_of_words = a.words.get(name, {}), b.words.get(name, {})
         commonest = [[Counter(own).most_common(1)[0][0] for own in side.values()] for side in sides_of_words]
-        yield _word_law(name, _groups_name(sides_of_words), (commonest[0], commonest[1]), most_p)
+        yield compare_words(name, _groups_name(sides_of_words), (commonest[0], commonest[1]), most_p)
 
 
 def _groups_name(sides: tuple[Mapping[_Group, Any], ...]) -> Units:
@@ -244,67 +222,6 @@ def _is_swayed(side: Mapping[_Group, Sequence[float]]) -> bool:
     if all(len(set(own)) == 1 for own in groups):
         return True
     return bool(stats.kruskal(*groups).pvalue < _SWAYED)
-
-
-def _number_law(name: str, units: Units, values: tuple[NDArray[Any], NDArray[Any]], most_p: float) -> LawDiff:
-    distance, p = 0.0, 1.0
-    if min(len(side) for side in values) >= _FEWEST:
-        with warnings.catch_warnings():
-            # Where its exact count rounds to more than 1, it takes the limit for many draws and says so.
-            warnings.simplefilter("ignore", RuntimeWarning)
-            tested = stats.ks_2samp(*values)
-        distance, p = float(tested.statistic), float(tested.pvalue)
-    return _law(name, units, values, (distance, p, most_p))
-
-
-def _law(
-    name: str, units: Units, values: tuple[NDArray[Any], NDArray[Any]], tested: tuple[float, float, float]
-) -> LawDiff:
-    distance, p, most_p = tested
-    both = np.concatenate(values)
-    low, high = (float(both.min()), float(both.max())) if len(both) else (0.0, 1.0)
-    edges = np.linspace(low, high if high > low else low + 1.0, 25)
-    shares = [np.histogram(side, edges)[0] / max(len(side), 1) for side in values]
-    return LawDiff(
-        name=name,
-        units=units,
-        counts=(len(values[0]), len(values[1])),
-        typical=(_typical(values[0]), _typical(values[1])),
-        distance=distance,
-        p=p,
-        differs=p < most_p,
-        shares=(tuple(shares[0].tolist()), tuple(shares[1].tolist())),
-        ends=(f"{low:.4g}", f"{high:.4g}"),
-    )
-
-
-def _typical(values: NDArray[Any]) -> str:
-    return f"{float(np.median(values)):.4g}" if len(values) else "none"
-
-
-def _word_law(name: str, units: Units, words: tuple[list[str], list[str]], most_p: float) -> LawDiff:
-    vocabulary = sorted({*words[0], *words[1]})
-    codes = [np.array([vocabulary.index(word) for word in side], dtype=int) for side in words]
-    shares = [np.bincount(side, minlength=len(vocabulary)) / max(len(side), 1) for side in codes]
-    distance, p = 0.5 * float(np.abs(shares[0] - shares[1]).sum()), 1.0
-    if min(map(len, codes)) >= _FEWEST and distance > 0:
-        # Draws of counts when the groups of both are dealt anew; each word's counts follow from the columns' sums.
-        total, rng = np.bincount(np.concatenate(codes), minlength=len(vocabulary)), np.random.default_rng(1)
-        dealt = rng.multivariate_hypergeometric(total, len(codes[0]), size=_PERMUTATIONS)
-        others = 0.5 * np.abs(dealt / len(codes[0]) - (total - dealt) / len(codes[1])).sum(axis=1)
-        p = float((1 + (others >= distance - 1e-12).sum()) / (1 + _PERMUTATIONS))
-    typical = [Counter(side).most_common(1)[0][0] if side else "none" for side in words]
-    return LawDiff(
-        name=name,
-        units=units,
-        counts=(len(words[0]), len(words[1])),
-        typical=(typical[0], typical[1]),
-        distance=distance,
-        p=p,
-        differs=p < most_p,
-        shares=(tuple(shares[0].tolist()), tuple(shares[1].tolist())),
-        ends=tuple(vocabulary),
-    )
 
 
 class _Measured(NamedTuple):
@@ -357,16 +274,19 @@ PIXEL_MEASURES: dict[str, Callable[[NDArray[np.float32]], float]] = {
 """Of a left image, (H, W) or (H, W, 3) from 0 to 1 as it is stored."""
 
 
-def _spread(indices: list[int], drawn: Mapping[int, _Drawn], count: int) -> list[int]:
-    """At most `count` of the indices, evenly, one of each scene as long as there are enough scenes."""
+def _evenly(indices: list[int], count: int) -> list[int]:
+    """At most `count` of the indices, the first and the last among them."""
+    return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, count).astype(int))]
+
+
+def _of_each_scene(drawn: Mapping[int, _Drawn], count: int) -> list[int]:
+    """One frame of each of at most `count` scenes."""
     of_scene: dict[int, list[int]] = defaultdict(list)
-    for index in indices:
-        of_scene[drawn[index].scene_id].append(index)
-    # In a scene not always the first, which may be special.
+    for index, each in drawn.items():
+        of_scene[each.scene_id].append(index)
+    # Of a scene not always the first, which may be special.
     by_turn = [own[(rank * 7) % len(own)] for rank, own in enumerate(of_scene.values())]
-    if len(by_turn) > count:
-        by_turn = [by_turn[k * len(by_turn) // count] for k in range(count)]
-    return sorted(by_turn)
+    return sorted(_evenly(by_turn, count))
 
 
 def _measure(source: Dataset, indices: Sequence[int]) -> list[_Measured]:
@@ -386,18 +306,10 @@ def _digest(data: bytes) -> bytes:
 def _pixel_laws(a: Sequence[_Measured], b: Sequence[_Measured], are_same: bool, most_p: float) -> Iterator[LawDiff]:
     for name in PIXEL_MEASURES:
         values = tuple(np.array([one.values[name] for one in side]) for side in (a, b))
-        if not are_same:
-            yield _number_law(name, "scenes", (values[0], values[1]), most_p)
-            continue
-        change = values[1] - values[0]
-        moved = change[change != 0]
-        distance = float((change > 0).mean() + 0.5 * (change == 0).mean() - 0.5) if len(change) else 0.0
-        p = float(stats.wilcoxon(moved).pvalue) if len(moved) >= _FEWEST else 1.0
-        yield _law(name, "pairs of the same frames", (values[0], values[1]), (distance, p, most_p))
-
-
-def _recipe_table(recipe: Recipe) -> dict[str, Any]:
-    return recipe.model_dump(mode="json")
+        if are_same:
+            yield compare_changes(name, (values[0], values[1]), most_p)
+        else:
+            yield compare_numbers(name, "scenes", (values[0], values[1]), most_p)
 
 
 def _manifest_table(manifest: Manifest) -> dict[str, Any]:
@@ -449,4 +361,6 @@ def diff_lines(found: DatasetDiff) -> Iterator[str]:
         mark = "  differs" if law.differs else ""
         a, b = (text[:12] for text in law.typical)
         yield f"{law.name:<28} {a:>12} {b:>12} {law.distance:9.3f} {law.p:8.2g}{mark}"
+    if found.untold:
+        yield f"too few scenes or pairs to tell a difference: {', '.join(found.untold)}"
     yield found.verdict

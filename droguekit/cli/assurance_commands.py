@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from drogue_models.frozen_model import FrozenModel
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, output_option
 from droguekit.cli.main import FAULT
@@ -47,7 +48,6 @@ def coverage(
 
     Exits with 1 where a cell has fewer pairs than the domain asks for.
     """
-    from datasets_manifest.atomic import write_text_atomic
     from droguekit.assurance.coverage import coverage_lines, measure_coverage
     from droguekit.assurance.design_domain import load_domain
     from droguekit.visualization.coverage_page import write_coverage_page
@@ -56,9 +56,7 @@ def coverage(
     found = measure_coverage(dataset, domain, estimates, detections or (), progress_report())
     for line in coverage_lines(found):
         typer.echo(line)
-    if json_ is not None:
-        json_.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(json_, found.model_dump_json(indent=1) + "\n")
+    _write_numbers(found, json_)
     if html is not None:
         write_coverage_page(found, domain, html)
         typer.echo(f"wrote {html}")
@@ -83,18 +81,23 @@ def diff(
 
     Exits with 1 where labels or pixels differ.
     """
-    from datasets_manifest.atomic import write_text_atomic
     from droguekit.assurance.dataset_diff import FALSE_ALARMS, diff_datasets, diff_lines
     from droguekit.visualization.diff_page import write_diff_page
 
     found = diff_datasets(a, b, pairs, progress_report())
     for line in diff_lines(found):
         typer.echo(line)
-    if json_ is not None:
-        json_.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(json_, found.model_dump_json(indent=1) + "\n")
+    _write_numbers(found, json_)
     if html is not None:
         write_diff_page(found, (a, b), html, FALSE_ALARMS)
         typer.echo(f"wrote {html}")
     if found.differs:
         raise typer.Exit(FAULT)
+
+
+def _write_numbers(found: FrozenModel, out: Path | None) -> None:
+    from datasets_manifest.atomic import write_text_atomic
+
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(out, found.model_dump_json(indent=1) + "\n")

@@ -69,9 +69,7 @@ def write_check_page(
         "Computed from the recipe's light, exposure and sensor, with the drogue on the cameras' axis. "
         "The pictures are rendered, and stretched to their brightest parts."
     )
-    if advice:
-        description += " What will fail, and what to change: " + "; ".join(advice) + "."
-    write_figure_page(f"What to expect of {name}", description, _figures(rows, pictures), lines, out)
+    write_figure_page(f"What to expect of {name}", description, _figures(rows, pictures), lines, out, advice)
 
 
 def _figures(rows: Sequence[Prediction], pictures: Sequence[DroguePicture]) -> Iterator[PlanFigure]:

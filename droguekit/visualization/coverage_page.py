@@ -6,77 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from jinja2 import Environment, StrictUndefined
-
 from datasets_manifest.atomic import write_text_atomic
 from droguekit.assurance.coverage import Coverage, CrossingCoverage, DomainCell, Share
 from droguekit.assurance.design_domain import DesignDomain
-
-_TEMPLATE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-:root { color-scheme: light dark; --page: #fff; --ink: #1c2026; --soft: #5b6470; --line: #d5dae0;
-  --lacks: #f6c9c3; --enough: #d3e8d5; --free: #eef1f4; }
-@media (prefers-color-scheme: dark) { :root { --page: #15181c; --ink: #e6e9ed; --soft: #9aa4b0; --line: #3a424c;
-  --lacks: #6b2d28; --enough: #24482b; --free: #22272d; } }
-body { margin: 0 auto; padding: 1.5rem; max-width: 72rem; background: var(--page); color: var(--ink);
-  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; }
-h2 { font-size: 1.15rem; margin: 2rem 0 0.4rem; }
-p { margin: 0.3rem 0; }
-.note { color: var(--soft); font-size: 0.9rem; }
-.verdict { font-weight: 600; }
-.scroll { overflow-x: auto; }
-table { border-collapse: separate; border-spacing: 3px; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; color: var(--soft); padding: 0.3rem 0; }
-th { font-weight: 500; text-align: left; color: var(--soft); padding: 0.2rem 0.5rem; white-space: nowrap; }
-td { text-align: right; padding: 0.35rem 0.6rem; border-radius: 4px; background: var(--free); vertical-align: top; }
-td.lacks { background: var(--lacks); }
-td.enough { background: var(--enough); }
-td b { display: block; font-size: 1rem; }
-td span { display: block; font-size: 0.78rem; white-space: nowrap; }
-</style>
-</head>
-<body>
-<h1>{{ title }}</h1>
-<p>{{ domain.description }}</p>
-<p class="verdict">{{ verdict }}</p>
-<p class="note">Large numbers are pairs. {% if scored %}Below them: the share of solved cases with its 95 % interval, of
-{{ scored|join(", ") }}. A pose is solved where its position is wrong by at most {{ position_percent }} % of the
-distance, a box where it overlaps the drogue's by half.{% endif %}</p>
-{% for crossing in crossings %}
-<h2>{{ crossing.title }}</h2>
-<p class="note">{{ crossing.note }}</p>
-<div class="scroll">
-{% for table in crossing.tables %}
-<table>
-{% if table.caption %}<caption>{{ table.caption }}</caption>{% endif %}
-<tr><th>{{ table.corner }}</th>{% for name in table.columns %}<th scope="col">{{ name }}</th>{% endfor %}</tr>
-{% for row in table.rows %}
-<tr><th scope="row">{{ row.name }}</th>
-{% for cell in row.cells %}
-<td class="{{ cell.kind }}"><b>{{ cell.pairs }}</b>{% for line in cell.lines %}<span>{{ line }}</span>{% endfor %}</td>
-{% endfor %}
-</tr>
-{% endfor %}
-</table>
-{% endfor %}
-</div>
-{% endfor %}
-<h2>Where the ends of the cells come from</h2>
-<ul>
-{% for name, quantity in domain.quantities.items() if quantity.source or outside[name] %}
-<li>{{ name }}{% if quantity.source %}: {{ quantity.source }}{% endif %}
-{%- if outside[name] %} ({{ outside[name] }} pairs lie outside of the bins){% endif %}</li>
-{% endfor %}
-</ul>
-</body>
-</html>
-"""
+from droguekit.scoring.report.html_page import page_template
 
 
 class _ShownCell(NamedTuple):
@@ -115,19 +48,15 @@ def write_coverage_page(coverage: Coverage, domain: DesignDomain, out: Path) -> 
         OSError: it cannot be written.
     """
     lacking = sum(len(crossing.lacking) for crossing in coverage.crossings)
-    page = (
-        Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-        .from_string(_TEMPLATE)
-        .render(
-            title=f"What {coverage.dataset} covers of {coverage.domain}",
-            domain=domain,
-            verdict=f"{coverage.pairs} pairs; "
-            + (f"{lacking} cells have too few" if lacking else "every cell has the pairs that it needs"),
-            scored=coverage.scored,
-            position_percent=f"{100 * domain.most_position_error_fraction:g}",
-            outside=coverage.outside,
-            crossings=[_shown(crossing, domain) for crossing in coverage.crossings],
-        )
+    page = page_template("coverage_page.html.j2", __package__).render(
+        title=f"What {coverage.dataset} covers of {coverage.domain}",
+        domain=domain,
+        verdict=f"{coverage.pairs} pairs; "
+        + (f"{lacking} cells have too few" if lacking else "every cell has the pairs that it needs"),
+        scored=coverage.scored,
+        position_percent=f"{100 * domain.most_position_error_fraction:g}",
+        outside=coverage.outside,
+        crossings=[_shown(crossing, domain) for crossing in coverage.crossings],
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(out, page)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,6 +18,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import Recipe
 from droguekit.batch.recipe_plan import RecipePlan, check_places, check_sizes, distance_share
+from droguekit.scoring.report.html_page import page_template
 from geometry.se3 import Array
 
 _PANEL_IN = (6.2, 4.4)
@@ -26,38 +26,6 @@ _DPI = 130
 _BAR, _LAW = "#7aa9d8", "#b03a2e"
 _BINS = 24
 _CELL_PX = 40
-_TEMPLATE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { margin: 0 auto; padding: 1.5rem; max-width: 80rem; background: #fff; color: #1c2026;
-  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; }
-h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; }
-.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.2rem; }
-figure { margin: 0; }
-figure img { display: block; width: 100%; height: auto; }
-figcaption { color: #5b6470; font-size: 0.88rem; }
-pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.82rem; line-height: 1.35; }
-</style>
-</head>
-<body>
-<h1>{{ title }}</h1>
-<p>{{ description }}</p>
-<div class="panels">
-{% for figure in figures %}
-<figure><img alt="{{ figure.title }}" src="data:image/png;base64,{{ figure.data }}">
-<figcaption>{{ figure.caption }}</figcaption></figure>
-{% endfor %}
-</div>
-<h2>In numbers</h2>
-<pre>{{ lines }}</pre>
-</body>
-</html>
-"""
 
 
 @dataclass(frozen=True)
@@ -235,7 +203,12 @@ def write_plan_page(recipe: Recipe, planned: RecipePlan, lines: Sequence[str], o
 
 
 def write_figure_page(
-    title: str, description: str, figures: Iterable[PlanFigure], lines: Sequence[str], out: Path
+    title: str,
+    description: str,
+    figures: Iterable[PlanFigure],
+    lines: Sequence[str],
+    out: Path,
+    advice: Sequence[str] = (),
 ) -> None:
     """Write a page with pictures and the lines that a command prints; it is replaced as a whole, or not at all.
 
@@ -245,6 +218,7 @@ def write_figure_page(
         figures: the pictures.
         lines: printed by the command.
         out: file to write.
+        advice: what will fail and what to change, told before the pictures.
 
     Raises:
         OSError: it cannot be written.
@@ -253,7 +227,9 @@ def write_figure_page(
         {"title": figure.title, "caption": figure.caption, "data": base64.b64encode(figure.png).decode("ascii")}
         for figure in figures
     ]
-    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True).from_string(_TEMPLATE)
-    page = template.render(title=title, description=description, figures=shown, lines="\n".join(lines) + "\n")
+    template = page_template("plan_page.html.j2", __package__)
+    page = template.render(
+        title=title, description=description, advice=advice, figures=shown, lines="\n".join(lines) + "\n"
+    )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(out, page)

@@ -6,6 +6,7 @@ at dusk and at night, the exposure law, and the sensor. The drogue faces the cam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -30,7 +31,6 @@ _SPARE_PX, _CELLS = 4, 8
 _WITHIN_PIXEL_PX = 0.2
 _SMALLEST_RADIUS_PX, _LEAST_GAP_PX, _LEAST_BOX_PX = 0.3, 3.0, 16.0
 _MOST_CLIPPED = 0.95
-_ROUND_CD_M2 = 1000.0
 
 
 @dataclass(frozen=True)
@@ -335,17 +335,17 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     when = {"day": "by day", "dusk": "at dusk", "night": "at night"}.get(light.light, "in this light")
     if light.marker_cd_m2 < light.sky_cd_m2 and recipe.drogue.body is None:
         wanted = _rounded(1.5 * light.sky_cd_m2)
-        use = f"{wanted:,.0f} cd/m2" if lit else f"lamps of {wanted:,.0f} cd/m2"
+        use = f"{_text(wanted)} cd/m2" if lit else f"lamps of {_text(wanted)} cd/m2"
         if recipe.sensor.band_nm is None:
             use += " or infrared lamps and a filter (rig preset mono-850)"
-        against = f"{light.marker_cd_m2:,.0f} against {light.sky_cd_m2:,.0f} cd/m2"
+        against = f"{_text(light.marker_cd_m2)} against {_text(light.sky_cd_m2)} cd/m2"
         yield f"{name} are darker than the sky {when}, {against}: use {use}"
     faint = [row for row in rows if row.snr < LEAST_SNR or row.contrast <= 0]
     if faint:
         wanted = _rounded(max(light.marker_cd_m2, 1.0) * LEAST_SNR / max(min(row.snr for row in faint), 0.1))
         yield (
             f"{name} are below {LEAST_SNR:g} deviations of the noise {when} from {faint[0].distance_m:.3g} m on: use "
-            f"{wanted:,.0f} cd/m2, a wider aperture or a longer exposure"
+            f"{_text(wanted)} cd/m2, a wider aperture or a longer exposure"
         )
     clipped = [row for row in rows if row.clipped_fraction > _MOST_CLIPPED]
     if clipped:
@@ -356,5 +356,10 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
 
 
 def _rounded(luminance_cd_m2: float) -> float:
-    step = _ROUND_CD_M2 if luminance_cd_m2 > _ROUND_CD_M2 else 10.0
-    return float(np.ceil(luminance_cd_m2 / step) * step)
+    """Two figures, upwards."""
+    step = 10.0 ** (math.floor(math.log10(max(luminance_cd_m2, 1e-9))) - 1)
+    return math.ceil(luminance_cd_m2 / step) * step
+
+
+def _text(luminance_cd_m2: float) -> str:
+    return f"{luminance_cd_m2:,.0f}" if luminance_cd_m2 >= 100 else f"{luminance_cd_m2:.2g}"

@@ -27,10 +27,8 @@ from scenes.sky.photometry import infrared_light, infrared_weights
 
 # Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
 MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
-# Our assumption, see `near_infrared`.
-_INFRARED_WEIGHTS = np.array([[0.95, 0.35, -0.3]], dtype=np.float32)
-_GREENNESS_WEIGHTS = 4.0 * np.array([[-0.5, 1.0, -0.5]], dtype=np.float32)
-_LEAST_INFRARED = np.float32(0.3)
+# Of drawn cameras for the near infrared, as of the rig behind a filter. [nm]
+_CAMERA_BAND_NM = 850.0
 # Sites of the RGGB mosaic: channel, first row, first column.
 _MOSAIC_SITES = ((0, 0, 0), (1, 0, 1), (1, 1, 0), (2, 1, 1))
 
@@ -107,7 +105,7 @@ def _sample_sites(seen: NDArray[np.float32], frame: FrameSpec) -> NDArray[np.flo
     camera, color = frame.camera, frame.sensor.color
     if frame.is_monochrome:
         if camera is not None and camera.spectrum == "near-infrared":
-            return near_infrared(seen)
+            return infrared_light(seen, _CAMERA_BAND_NM)
         return monochrome_light(seen, frame.sensor)
     if color == "rgb" and (camera is None or camera.processing is None):
         return seen
@@ -128,18 +126,6 @@ def monochrome_light(light: NDArray[np.float32], sensor: Sensor) -> NDArray[np.f
 def mono_weights(sensor: Sensor) -> NDArray[np.float64]:
     """(1, 3) weights of the three bands in a monochrome sensor, without what plants have beyond red."""
     return MONO_WEIGHTS.astype(np.float64) if sensor.band_nm is None else infrared_weights(sensor.band_nm)[None]
-
-
-def near_infrared(seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) light of a silicon sensor behind a filter that passes the near infrared, estimated from (H, W, 3) light.
-
-    A rule of thumb, as the three bands hold no infrared: neutral surfaces stay as bright as they are, the clear sky is
-    dark, and what is greener than grey, which only plants are by much, is several times as bright.
-    """
-    along = cv2.transform(seen, _INFRARED_WEIGHTS)
-    green = cv2.transform(seen, _GREENNESS_WEIGHTS)
-    result: NDArray[np.float32] = np.maximum(along, _LEAST_INFRARED * seen[..., 0]) + np.maximum(green, 0.0)
-    return result
 
 
 @lru_cache(maxsize=2)

@@ -19,7 +19,8 @@ from scenes.sampler import sample_frame
 
 WIDTH_PX, HEIGHT_PX = 640, 480
 KEY_FILE = "key.json"
-# A window of a photograph is enlarged in no case, and shows at least this share of its width or height.
+# A window shows at least this share of a photograph's width or height, and more of a small one, so that it need not be
+# enlarged.
 _LEAST_SHARE = 0.45
 
 Picture = NDArray[np.uint8]
@@ -43,7 +44,7 @@ def photograph_window(picture: Picture, rng: np.random.Generator) -> Picture:
     """(480, 640, 3) part of a photograph at a random place."""
     height, width = picture.shape[:2]
     most = min(width / WIDTH_PX, height / HEIGHT_PX)
-    scale = most * rng.uniform(_LEAST_SHARE, 1.0)
+    scale = max(most * rng.uniform(_LEAST_SHARE, 1.0), min(most, 1.0))
     part = max(int(scale * WIDTH_PX), 1), max(int(scale * HEIGHT_PX), 1)
     x, y = (int(rng.integers(0, size - own + 1)) for size, own in zip((width, height), part, strict=True))
     return _fitted(picture[y : y + part[1], x : x + part[0]])
@@ -66,6 +67,7 @@ def make_test(recipe: Recipe, photographs: Sequence[Path], count: int, out: Path
     rng = np.random.default_rng(seed)
     if not photographs:
         raise ValueError("--photographs: must name at least one picture")
+    out.mkdir(parents=True)
     mixed: list[tuple[str, Picture]] = []
     for index in range(count):
         path = photographs[index % len(photographs)]
@@ -75,7 +77,6 @@ def make_test(recipe: Recipe, photographs: Sequence[Path], count: int, out: Path
         mixed.append((f"photograph {path.name}", photograph_window(picture.astype(np.uint8), rng)))
         frame_index = index * recipe.frames.count // count
         mixed.append((f"ours {recipe.name} frame {frame_index}", surroundings_frame(recipe, frame_index)))
-    out.mkdir(parents=True)
     key = {}
     for number, which in enumerate(rng.permutation(len(mixed)), start=1):
         name, picture = mixed[which]
@@ -98,7 +99,8 @@ def score(key_file: Path, answers: Sequence[Path]) -> str:
     rows = ["| judge | ours called photographs | photographs called photographs |", "|---|---|---|"]
     for path in answers:
         with path.open(encoding="utf-8", newline="") as lines:
-            said = {f"{int(row['number']):02d}": row["answer"].strip() for row in csv.DictReader(lines)}
+            rows_said = [(row.get("number") or "", row.get("answer") or "") for row in csv.DictReader(lines)]
+        said = {number.strip().zfill(2): answer.strip() for number, answer in rows_said}
         if said.keys() != key.keys() or not set(said.values()) <= {"photograph", "render"}:
             raise ValueError(f"{path}: must say photograph or render of each number from 01 to {len(key):02d}")
         cells = []

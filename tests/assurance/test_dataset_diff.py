@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from droguekit.assurance import dataset_diff
-from droguekit.assurance.dataset_diff import DatasetDiff, LawDiff, diff_datasets
+from droguekit.assurance.dataset_diff import DatasetDiff, diff_datasets
+from droguekit.assurance.law_comparison import LawDiff, compare_changes, compare_numbers, compare_words
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, recipe_text
 from tests.support.small_datasets import rendered
@@ -47,7 +47,7 @@ def test_a_copy_is_the_same(dataset: Path, tmp_path: Path, capsys: pytest.Captur
     numbers, page = tmp_path / "diff.json", tmp_path / "diff.html"
     command = ["diff", str(dataset), str(tmp_path / "copy"), "--json", str(numbers), "--html", str(page)]
     assert run(command) == DONE
-    assert "the same 20 frames, and the same pixels in the 20 compared" in capsys.readouterr().out
+    assert "the same 20 frames; the same pixels in the 20 compared" in capsys.readouterr().out
     found = DatasetDiff.model_validate_json(numbers.read_text())
     assert found.recipe == () and found.manifest == () and found.same_frames == 20
     assert all(each.p == 1.0 for each in found.pixels)
@@ -93,17 +93,42 @@ def test_another_encoding_is_found_on_the_same_frames(dataset: Path, tmp_path: P
 
 def test_chances_of_words_are_those_of_fisher() -> None:
     words = ["sea"] * 9 + ["town"] * 3, ["sea"] * 3 + ["town"] * 9
-    found = dataset_diff._word_law("ground", "scenes", words, 1e-3)
+    found = compare_words("ground", "scenes", words, 1e-3)
     exact = stats.fisher_exact([[9, 3], [3, 9]]).pvalue
     # Four standard errors of a share of 9,999 draws.
     assert found.p == pytest.approx(exact, abs=4 * np.sqrt(exact / 9_999))
     assert found.distance == pytest.approx(0.5)
 
 
-def test_too_few_scenes_tell_nothing(dataset: Path, tmp_path: Path) -> None:
-    one = made(tmp_path / "one", frames={"count": 6, "scenes": 1})
-    found = diff_datasets(one, made(tmp_path / "two", seed=9, frames={"count": 6, "scenes": 1}))
-    assert law(found, "family").p == 1.0 and law(found, "mean_level").p == 1.0
+@pytest.mark.parametrize("count", [7, 8])
+def test_fewer_than_eight_scenes_of_each_never_differ(count: int) -> None:
+    """Of all ways to choose 8 of 16, 2 have one sample below the other: 2 / 12870 is less than 0.005 / 27."""
+    low, high = np.arange(count, dtype=float), np.arange(count, dtype=float) + 100.0
+    numbers = compare_numbers("altitude_m", "scenes", (low, high), 0.005 / 27)
+    assert numbers.distance == 1.0 and numbers.can_differ == numbers.differs == (count == 8)
+    assert not compare_words("ground", "scenes", (["sea"] * 4, ["town"] * 4), 0.005 / 27).can_differ
+
+
+def test_changes_of_the_same_pairs_need_fewer_draws_than_two_samples() -> None:
+    values = np.linspace(0.2, 0.8, 16)
+    changed = values + 1e-6 * np.arange(1, 17)
+    found = compare_changes("noise", (values, changed), 0.005 / 27)
+    assert found.differs and found.distance == 0.5
+    assert not compare_numbers("noise", "scenes", (values, changed), 0.005 / 27).differs
+    still = compare_changes("noise", (values, values), 0.005 / 27)
+    assert (still.p, still.distance, still.differs) == (1.0, 0.0, False)
+
+
+def test_many_draws_are_compared_without_overflow() -> None:
+    values = np.random.default_rng(2).normal(size=(2, 50_000))
+    assert compare_numbers("distance_m", "pairs", (values[0], values[1]), 1e-4).can_differ
+
+
+def test_what_cannot_be_told_is_said(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["diff", str(dataset), str(dataset), "--pairs", "0"]) == DONE
+    told = capsys.readouterr().out
+    assert "too few scenes or pairs to tell a difference: altitude_m" in told
+    assert told.strip().endswith("the same 20 frames; pixels were not compared")
 
 
 def test_wrong_input_is_named(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

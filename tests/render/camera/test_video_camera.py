@@ -25,7 +25,7 @@ from geometry.se3 import Array
 from render.camera.image_coding import draw_overlay, intra_coded, jpeg, one_field
 from render.camera.image_processing import noise_by_level, tone_tables
 from render.camera.optics import saturation_cd_m2
-from render.camera.sensor import expose, near_infrared
+from render.camera.sensor import expose
 from render.camera.video_lens import add_bloom, ghosts, see_through, shift_colors
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sampler import sample_frame
@@ -290,11 +290,19 @@ def test_the_colour_of_a_view_is_taken_as_far_to_grey_as_asked(frame: FrameSpec)
         np.testing.assert_allclose(linear / linear[1], tint ** (1.0 - share), rtol=0.02)
 
 
-def test_infrared_darkens_the_sky_brightens_leaves_and_leaves_grey() -> None:
-    colours = np.array([[[0.2, 0.4, 0.9], [0.05, 0.09, 0.03], [0.4, 0.4, 0.4]]], np.float32)
-    sky, leaves, grey = near_infrared(colours)[0]
-    assert sky < 0.2 and leaves > 0.2
-    assert grey == pytest.approx(0.4, rel=1e-6)
+def test_infrared_darkens_the_sky_brightens_leaves_and_leaves_grey(frame: FrameSpec) -> None:
+    visible, infrared = (with_camera(frame, VideoCamera(spectrum=spectrum)) for spectrum in ("grey", "near-infrared"))
+    shares = []
+    for colour in ([0.2, 0.4, 0.9], [0.05, 0.09, 0.03], [0.4, 0.4, 0.4]):
+        pair = pair_of(flat_light(0.2), frame)
+        tint = np.array(colour, np.float32)
+        seen = EyeRadiance(**{**vars(pair.left), "radiance_cd_m2": pair.left.radiance_cd_m2 * tint})
+        light = StereoRadiance(**{**vars(pair), "left": seen, "right": seen})
+        levels = [expose(each, light).left[20:-20, 20:-20].mean() / 255 for each in (infrared, visible)]
+        shares.append(light_from_srgb(np.array(levels[0])) / light_from_srgb(np.array(levels[1])))
+    sky, leaves, grey = shares
+    assert sky < 0.25 and leaves > 3.0
+    assert grey == pytest.approx(1.0, rel=0.02)
 
 
 def test_jpeg_is_that_of_another_codec() -> None:
