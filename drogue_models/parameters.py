@@ -82,6 +82,44 @@ class SatinPaint(FrozenModel):
     roughness: float = Field(default=0.25, ge=0.05, le=1.0)
 
 
+class MarkerCode(FrozenModel):
+    """How self-lit markers blink, each in a rhythm of its own, so that equal lamps can be told apart.
+
+    Attributes:
+        slot_s: how long a lamp stays lit or dark at least. [s]
+        patterns: of each marker, or one for all: its slots in turn, `1` lit and `0` dark, repeated without end. Time
+            zero of the images' time stamps is in the middle of the first.
+    """
+
+    slot_s: float = Field(ge=1e-4, le=60)
+    patterns: tuple[Annotated[str, Field(pattern=r"^[01]*1[01]*$", max_length=256)], ...] = Field(
+        min_length=1, max_length=32
+    )
+
+    def lit_fractions(self, time_s: float, exposure_s: float) -> tuple[float, ...]:
+        """For each pattern the share of an exposure in which the lamp is lit.
+
+        Args:
+            time_s: mid-exposure. [s]
+            exposure_s: exposure time. [s]
+        """
+        return tuple(self._lit_fraction(pattern, time_s, exposure_s) for pattern in self.patterns)
+
+    def _lit_fraction(self, pattern: str, time_s: float, exposure_s: float) -> float:
+        # In slots from the beginning of a round, so that large time stamps lose no digits.
+        begin = ((time_s + (self.slot_s - exposure_s) / 2) % (len(pattern) * self.slot_s)) / self.slot_s
+        end = begin + exposure_s / self.slot_s
+        first, last = math.floor(begin), math.floor(end)
+        if first == last or exposure_s == 0:
+            return float(pattern[first % len(pattern)])
+        rounds, rest = divmod(last - first - 1, len(pattern))
+        lit = rounds * pattern.count("1") + sum(int(pattern[(first + 1 + i) % len(pattern)]) for i in range(rest))
+        lit_slots = lit + int(pattern[first % len(pattern)]) * (first + 1 - begin)
+        lit_slots += int(pattern[last % len(pattern)]) * (end - last)
+        # Rounded, so that a lamp that is lit all the time is lit fully.
+        return min(1.0, round(lit_slots / (end - begin), 9))
+
+
 # Markers on a body without a face lie in round dark holders of this width around them and this thickness (our choice).
 HOLDER_BORDER_M = 0.006
 HOLDER_THICKNESS_M = 0.005
@@ -110,6 +148,7 @@ class DrogueParameters(FrozenModel):
         marker_reflectance_rgb: diffuse reflectance in linear Rec. 709.
         marker_luminance_cd_m2: luminance of self-lit markers, 0 for painted ones. [cd/m2]
         marker_emission_rgb: colour of self-lit markers; scaled so that its luminance is 1.
+        marker_code: how self-lit markers blink, or None where they shine all the time.
         face_reflectance_rgb: of face and rim.
         canopy_reflectance_rgb: of the drag canopy: cloth, leaves or cone.
         structure_reflectance_rgb: of ribs, coupling and hose.
@@ -135,6 +174,7 @@ class DrogueParameters(FrozenModel):
     marker_reflectance_rgb: ReflectanceRgb = RED_PAINT
     marker_luminance_cd_m2: float = Field(default=0.0, ge=0, le=1e6)
     marker_emission_rgb: ReflectanceRgb = (1.0, 0.05, 0.05)
+    marker_code: MarkerCode | None = Field(default=None, exclude_if=lambda code: code is None)
     face_reflectance_rgb: ReflectanceRgb = MATT_BLACK
     canopy_reflectance_rgb: ReflectanceRgb = (0.16, 0.17, 0.15)
     structure_reflectance_rgb: ReflectanceRgb = (0.08, 0.08, 0.085)
@@ -158,11 +198,33 @@ class DrogueParameters(FrozenModel):
             for other, (x2, y2) in enumerate(self.marker_positions_m[:index]):
                 if math.hypot(x - x2, y - y2) <= 2 * (self.marker_radius_m + border_m):
                     raise ValueError(f"marker_positions_m: markers {other} and {index} overlap")
+        self._check_code()
         if self.hub is not None and self.hub.outer_radius_m >= self.coupling_radius_m:
             raise ValueError(f"coupling_radius_m: must exceed the hub's outer radius, {self.hub.outer_radius_m} m")
         if self.hose_radius_m >= self.coupling_radius_m:
             raise ValueError(f"hose_radius_m: must be below coupling_radius_m ({self.coupling_radius_m} m)")
         return self
+
+    def _check_code(self) -> None:
+        if self.marker_code is None:
+            return
+        if self.marker_luminance_cd_m2 == 0:
+            raise ValueError("marker_code: only lamps blink; set marker_luminance_cd_m2 above 0")
+        count = len(self.marker_code.patterns)
+        if count not in (1, self.marker_count):
+            raise ValueError(f"marker_code.patterns: must be {self.marker_count}, or one for all, got {count}")
+
+    def lit_fractions(self, time_s: float, exposure_s: float) -> tuple[float, ...]:
+        """For each marker the share of an exposure in which its lamp is lit; 1 for lamps that do not blink.
+
+        Args:
+            time_s: mid-exposure. [s]
+            exposure_s: exposure time. [s]
+        """
+        if self.marker_code is None:
+            return (1.0,) * self.marker_count
+        lit = self.marker_code.lit_fractions(time_s, exposure_s)
+        return lit if len(lit) == self.marker_count else lit * self.marker_count
 
     def _check_face(self) -> None:
         face_outer_m = self.rim_radius_m - self.rim_tube_radius_m

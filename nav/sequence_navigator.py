@@ -14,7 +14,7 @@ from time import perf_counter
 
 from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.storage.pair_faults import fault_reason
-from datasets_manifest.types.estimates import Estimate, NoFix
+from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import StereoRig
@@ -22,6 +22,7 @@ from nav.detector.detector import Detector
 from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
+from nav.filtering.roll_decoder import DecodedRoll, RollDecoder, turned_to, with_decoded_roll
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.pair_measurement import PairMeasurement
 from nav.pair_navigator import CentroidChoice, PairNavigator
@@ -145,6 +146,7 @@ class SequenceNavigator:
         self._navigator: PairNavigator | None = None
         self._observer: TrackedObserver | None = None
         self._filters: dict[str, PoseFilter] = {}
+        self._roll_decoder: RollDecoder | None = None
 
     @property
     def detects_every_pair(self) -> bool:
@@ -186,7 +188,7 @@ class SequenceNavigator:
         except Exception as error:
             fault = fault_reason(pair.frame_index, error)
             # A filter may have taken half of the pair, so the next one begins anew.
-            self._filters = {}
+            self._filters, self._roll_decoder = {}, None
             estimates = _without_fix(pair, settings.methods, fault)
             names = [name + FILTER_SUFFIX for name in settings.methods] if settings.filtered else []
             filtered = _without_fix(pair, names, fault)
@@ -207,12 +209,25 @@ class SequenceNavigator:
         estimates = measured.navigator.estimate_measured(
             pair.frame_index, pair.images, measured.measurement, settings.methods
         )
+        roll = self._decoded_roll(measured, estimates)
+        estimates = [with_decoded_roll(estimate, pair.drogue, roll) for estimate in estimates]
         if not settings.filtered:
             return estimates, []
         if measured.begins or not self._filters:
             order = marker_layout(pair.drogue).symmetry_order
             self._filters = {method: PoseFilter(settings.motion, order) for method in settings.methods}
-        return estimates, [self._filtered(pair, estimate) for estimate in estimates]
+        return estimates, [self._filtered(pair, estimate, roll) for estimate in estimates]
+
+    def _decoded_roll(self, measured: MeasuredPair, estimates: Sequence[Estimate]) -> DecodedRoll | None:
+        """The roll by the blinking of lamps, of the first method that has a pose; None where lamps do not blink."""
+        pair = measured.pair
+        if pair.drogue.marker_code is None:
+            return None
+        if measured.begins or self._roll_decoder is None:
+            self._roll_decoder = RollDecoder(pair.rig, pair.drogue)
+        poses = (estimate.left_from_drogue for estimate in estimates if isinstance(estimate, PoseEstimate))
+        pose = next(poses, None)
+        return None if pose is None else self._roll_decoder.decode(pair.images, pose)
 
     def _observer_of(self, navigator: PairNavigator, pair: BlindPair) -> TrackedObserver | None:
         if self._tracker is None:
@@ -221,8 +236,8 @@ class SequenceNavigator:
         every = settings.redetect_every
         return TrackedObserver(navigator, self._tracker, pair.rig, pair.drogue, every, settings.motion)
 
-    def _filtered(self, pair: BlindPair, measured: Estimate) -> Estimate:
-        """The filtered estimate; without a pose where there is no fix or the filter rejects it."""
+    def _filtered(self, pair: BlindPair, measured: Estimate, roll: DecodedRoll | None) -> Estimate:
+        """The filtered estimate with a decoded roll; without a pose where there is no fix or the filter rejects it."""
         method = measured.method + FILTER_SUFFIX
         if isinstance(measured, NoFix):
             return measured.model_copy(update={"method": method})
@@ -240,6 +255,7 @@ class SequenceNavigator:
             )
         docking = docking_quantities(update.state, pair.rig, pair.drogue, self._settings.capture_radius_m)
         estimate = update.state.to_estimate(pair.frame_index, method, measured)
+        estimate = estimate if roll is None else turned_to(estimate, pair.drogue, roll)
         stage_s = {**measured.stage_s, "filter": perf_counter() - start}
         return estimate.model_copy(update={"docking": docking, "stage_s": stage_s})
 

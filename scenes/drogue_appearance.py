@@ -46,6 +46,31 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
     return None if condition == as_new else condition
 
 
+def blinking_condition(
+    condition: DrogueCondition | None, drogue: DrogueParameters, time_s: float, exposure_s: float
+) -> DrogueCondition | None:
+    """The condition of a drogue in one exposure: lamps that blink shine for a share of it.
+
+    A lamp that is lit for a part of the exposure only is drawn with that share of its light all along.
+
+    Args:
+        condition: in its scene; None for a new drogue.
+        drogue: with its code.
+        time_s: mid-exposure. [s]
+        exposure_s: exposure time. [s]
+    """
+    if drogue.marker_code is None:
+        return condition
+    known = condition or DrogueCondition()
+    states = [known.of_marker(index) for index in range(drogue.marker_count)]
+    shares = drogue.lit_fractions(time_s, exposure_s)
+    markers = tuple(
+        state.model_copy(update={"lamp_fraction": state.lamp_fraction * lit})
+        for state, lit in zip(states, shares, strict=True)
+    )
+    return known.model_copy(update={"markers": markers})
+
+
 def _wear_of_scene(seed: int, scene_id: int, ranges: WearRanges) -> SurfaceWear:
     rng = frame_generator(seed, scene_id, "surface wear")
     pattern = int(rng.integers(2**31))

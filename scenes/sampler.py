@@ -18,7 +18,7 @@ from drogue_models.tankers.tanker import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.camera_sampling import camera_of_scene
-from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
+from scenes.drogue_appearance import blinking_condition, condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.flight.sequence import sequence_kinematics
@@ -138,6 +138,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     sensor, camera = camera_of_scene(scene_recipe, scene_id)
     exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
     condition = None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue)
+    if pose is not None:
+        condition = blinking_condition(condition, drogue, kinematics.time_s, exposure.time_s)
     neighbours = neighbours_of_frame(
         scene_recipe, scene_id, frame_index, kinematics, NeighbourKind(drogue, condition, tanker)
     )

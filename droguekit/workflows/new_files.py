@@ -36,6 +36,11 @@ marker_radius_m = {radius:g}
 marker_luminance_cd_m2 = {luminance:g}
 marker_emission_rgb = [1.0, 1.0, 1.0]
 marker_reflectance_rgb = [0.8, 0.8, 0.8]
+
+# Lamps that blink tell the roll of a ring: a pattern for each marker, 1 lit and 0 dark, and the length of a slot.
+# [marker_code]
+# slot_s = 0.04
+# patterns = ["01", "1", "1", ...]
 """
 _RIG = """# A stereo rig. Use it as `rig = "{file}"` in a recipe.
 # The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/recipes.md lists them.

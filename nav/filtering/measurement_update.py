@@ -95,10 +95,19 @@ def pose_difference(start: RigidTransform, end: RigidTransform) -> Array:
 
 def nearest_roll(pose: RigidTransform, rotation: Array, symmetry_order: int) -> RigidTransform:
     """The pose, rolled by the multiple of the markers' symmetry angle that brings it nearest to a rotation."""
-    turn = rotation.T @ pose.rotation
+    return rolled(pose, steps_to_roll(pose.rotation, rotation, symmetry_order), symmetry_order)
+
+
+def steps_to_roll(rotation: Array, wanted: Array, symmetry_order: int) -> int:
+    """Number of the markers' symmetry angles about the drogue's axis that bring a rotation nearest to another."""
+    turn = wanted.T @ rotation
     # The trace of `turn @ R_z(angle)` is largest where the angle undoes the roll.
     roll_rad = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-    steps = round(float(-roll_rad * symmetry_order / (2 * np.pi)))
+    return round(float(-roll_rad * symmetry_order / (2 * np.pi)))
+
+
+def rolled(pose: RigidTransform, steps: int, symmetry_order: int) -> RigidTransform:
+    """The pose after a number of the markers' symmetry angles about the drogue's axis."""
     if steps % symmetry_order == 0:
         return pose
     about_axis = exp_rotation(np.array([0.0, 0.0, 2 * np.pi * steps / symmetry_order]))

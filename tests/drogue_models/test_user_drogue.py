@@ -173,3 +173,38 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path, name: str, data: b
     drogue = load_drogue(write_toml(tmp_path, RING + f'body_mesh = "{name}"\n'))
     with pytest.raises(ValueError, match=f"body_mesh: .*{message}"):
         drogue_meshes(drogue)
+
+
+LAMPS = RING + "marker_radius_m = 0.01\nmarker_luminance_cd_m2 = 20000\n"
+
+
+def code(*patterns: str) -> str:
+    return f"[marker_code]\nslot_s = 0.1\npatterns = {list(patterns)}\n"
+
+
+def test_lamps_shine_for_the_share_of_an_exposure_in_which_their_slot_is_lit(tmp_path: Path) -> None:
+    patterns = ("10", "01", "1", "110", "1000", "011")
+    drogue = load_drogue(write_toml(tmp_path, LAMPS + code(*patterns)))
+    # Time zero is the middle of the first slot, whole rounds later too.
+    for time_s in (0.0, 1.2, -2.4, 1.2e9):
+        assert drogue.lit_fractions(time_s, 0.01) == (1, 0, 1, 1, 1, 0)
+    # Half of the exposure in the first slot, half in the second.
+    assert drogue.lit_fractions(0.05, 0.02) == (0.5, 0.5, 1, 1, 0.5, 0.5)
+    # Over many rounds the share is that of the pattern.
+    shares = drogue.lit_fractions(0.3, 12.0)
+    assert shares == pytest.approx([pattern.count("1") / len(pattern) for pattern in patterns], abs=1e-9)
+    # Against a sum over many instants.
+    instants = np.linspace(0.23 - 0.135, 0.23 + 0.135, 20001)
+    counted = np.mean([drogue.lit_fractions(float(time_s), 0.0) for time_s in instants], axis=0)
+    assert drogue.lit_fractions(0.23, 0.27) == pytest.approx(counted, abs=1e-3)
+
+
+def test_one_pattern_is_that_of_all_lamps_and_others_must_fit(tmp_path: Path) -> None:
+    assert load_drogue(write_toml(tmp_path, LAMPS + code("01"))).lit_fractions(0.0, 0.01) == (0,) * 6
+    assert load_drogue(write_toml(tmp_path, LAMPS)).lit_fractions(0.0, 0.01) == (1,) * 6
+    with pytest.raises(ValueError, match=r"marker_code.patterns: must be 6, or one for all, got 2"):
+        load_drogue(write_toml(tmp_path, LAMPS + code("01", "10")))
+    with pytest.raises(ValueError, match=r"marker_code: only lamps blink"):
+        load_drogue(write_toml(tmp_path, RING + code("01")))
+    with pytest.raises(ValueError, match=r"marker_code.patterns.0"):
+        load_drogue(write_toml(tmp_path, LAMPS + code("00")))

@@ -19,7 +19,7 @@ from datasets_manifest.recipe.rigs import _RigTable
 from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import MAX_MARKERS
-from drogue_models.presets import PRESETS
+from drogue_models.presets import PRESETS, load_drogue
 from droguekit.cli.main import COMMANDS, DONE, FAULT, INTERRUPTED, WRONG_INPUT, load_command
 from droguekit.workflows.rendering import MOST_TIMEOUT_S
 from geometry.se3 import RigidTransform
@@ -112,8 +112,11 @@ def test_the_example_of_an_estimates_file_can_be_read(tmp_path: Path) -> None:
     assert [estimate.status for estimate in read_estimates(tmp_path / "estimates.jsonl")] == ["fix", "no_fix"]
 
 
-def test_the_example_of_a_recipe_can_be_read(tmp_path: Path) -> None:
-    (example,) = code_blocks(REPOSITORY / "docs/how-to/add-a-drogue.md", "toml")
+def test_the_examples_of_a_recipe_and_of_blinking_lamps_can_be_read(tmp_path: Path) -> None:
+    example, code = code_blocks(REPOSITORY / "docs/how-to/add-a-drogue.md", "toml")
+    ring = 'name = "six"\nmarker_count = 6\nmarker_ring_radius_m = 0.27\nmarker_luminance_cd_m2 = 20000\n'
+    (tmp_path / "six.toml").write_text(ring + code, encoding="utf-8")
+    assert sum(load_drogue("six.toml", tmp_path).lit_fractions(0.0, 0.01)) == 5
     (tmp_path / "my-recipe.toml").write_text(example, encoding="utf-8")
     (tmp_path / "my-drogue.toml").write_text(text("drogue_models/examples/seven-markers.toml"), encoding="utf-8")
     assert load_recipe(str(tmp_path / "my-recipe.toml")).recipe.drogue.name == "seven-markers"

@@ -9,6 +9,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition
+from drogue_models.parameters import DrogueParameters
 from render.surfaces import DIRT_MAP_PX, dirt_map
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.sampler import sample_frame
@@ -151,3 +152,16 @@ def test_dirt_covers_the_share_that_is_asked_for(share: float) -> None:
 def test_a_wrong_section_is_named(target: dict[str, Any], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         recipe(**target)
+
+
+def test_the_frame_says_which_lamps_are_lit() -> None:
+    lamps = {"marker_luminance_cd_m2": 20_000.0, "marker_code": {"slot_s": 0.04, "patterns": ["10", "1"] * 4}}
+    plain = recipe(failed_lamp_fraction=0.3, lamp_fraction=[0.5, 0.9])
+    coded = plain.model_copy(update={"drogue": DrogueParameters(**(plain.drogue.model_dump() | lamps))})
+    for index in (0, 1):
+        drawn, shown = sample_frame(plain, index), sample_frame(coded, index)
+        assert drawn.condition is not None and shown.condition is not None and shown.drogue is not None
+        shares = shown.drogue.lit_fractions(shown.time_s, shown.exposure.time_s)
+        assert set(shares[1::2]) == {1.0} and set(shares[::2]) == {1.0 - index}
+        for before, after, share in zip(drawn.condition.markers, shown.condition.markers, shares, strict=True):
+            assert after == before.model_copy(update={"lamp_fraction": before.lamp_fraction * share})
