@@ -94,6 +94,14 @@ FORMATS: dict[str, ExportFormat] = {
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.poses.bop:write_bop"
     ),
     "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.annotations.part_masks:write_masks"),
+    "middlebury": ExportFormat(
+        "stereo pairs with the disparity of every pixel (PFM) and what the other eye does not see",
+        "labelgen.export.annotations.dense_matching:write_middlebury",
+    ),
+    "sintel": ExportFormat(
+        "sequences with forward optical flow (.flo) of both eyes and what is hidden in the next picture",
+        "labelgen.export.annotations.dense_matching:write_sintel",
+    ),
     "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.poses.calibration_export:write_opencv"),
     "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.poses.calibration_export:write_kalibr"),
     "ros-camera-info": ExportFormat(
