@@ -171,7 +171,7 @@ def _is_hidden(rig: StereoRig, eye: Eye, target_px: Array, depth_m: Array, other
 
 
 def _moved(before: FrameSpec, after: FrameSpec, part: int, points_m: Array) -> Array:
-    """(N, 3) where points of a part are in the later frame, nan where the frames do not say; both in the left camera."""
+    """(N, 3) where points of a part are in the later frame, nan where the frames do not say; in the left camera."""
     unknown = np.full_like(points_m, np.nan)
     if part == Part.HOSE:
         return _moved_hose(before, after, points_m)
