@@ -62,7 +62,8 @@ class Matches:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(H, W) whether the displacement is determined."""
-        return np.isfinite(self.displacement_px[..., 0])
+        finite: NDArray[np.bool_] = np.isfinite(self.displacement_px[..., 0])
+        return finite
 
     @property
     def matched(self) -> NDArray[np.bool_]:

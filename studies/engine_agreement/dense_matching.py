@@ -80,7 +80,8 @@ class Picture:
     @cached_property
     def is_inner(self) -> NDArray[np.bool_]:
         """(H, W) whether all pixels around have the same part id."""
-        return np.equal(cv2.dilate(self.part, _NEAR), cv2.erode(self.part, _NEAR))
+        inner: NDArray[np.bool_] = np.equal(cv2.dilate(self.part, _NEAR), cv2.erode(self.part, _NEAR))
+        return inner
 
     def marker_light(self, index: int) -> NDArray[np.float64] | None:
         """(H, W) light of a marker beyond that of the face, or None where not all of it is seen on the face."""
