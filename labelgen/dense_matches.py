@@ -31,7 +31,7 @@ _HOSE_STEPS, _HOSE_BLOCK = 4, 4096
 
 
 @dataclass(frozen=True, eq=False)
-class EyePasses:
+class SurfacePasses:
     """Passes of one eye through its pixel centres, as in a dataset's EXR files.
 
     Attributes:
@@ -46,7 +46,7 @@ class EyePasses:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class PixelMatches:
     """Where the points that one image shows lie in another image.
 
     Attributes:
@@ -71,7 +71,7 @@ class Matches:
         return self.known & ~self.hidden & ~self.outside
 
 
-def stereo_matches(rig: StereoRig, eye: Eye, seen: EyePasses, other: EyePasses) -> Matches:
+def stereo_matches(rig: StereoRig, eye: Eye, seen: SurfacePasses, other: SurfacePasses) -> PixelMatches:
     """Where the points of one eye's picture lie in the other eye's.
 
     The background counts as infinitely far, as renderers draw it.
@@ -89,7 +89,9 @@ def stereo_matches(rig: StereoRig, eye: Eye, seen: EyePasses, other: EyePasses) 
     return _matches(rig, target, points, far, other)
 
 
-def flow_matches(before: FrameSpec, after: FrameSpec, eye: Eye, seen: EyePasses, later: EyePasses) -> Matches:
+def flow_matches(
+    before: FrameSpec, after: FrameSpec, eye: Eye, seen: SurfacePasses, later: SurfacePasses
+) -> PixelMatches:
     """Where the points of one picture lie in the same eye's next one: optical flow forwards.
 
     Args:
@@ -111,7 +113,7 @@ def flow_matches(before: FrameSpec, after: FrameSpec, eye: Eye, seen: EyePasses,
     return _matches(rig, eye, points, far, later)
 
 
-def _points(rig: StereoRig, eye: Eye, seen: EyePasses, far: NDArray[np.bool_]) -> Array:
+def _points(rig: StereoRig, eye: Eye, seen: SurfacePasses, far: NDArray[np.bool_]) -> Array:
     """(H, W, 3) points in the eye's frame; for the background their directions."""
     height, width = seen.depth_m.shape
     rays = rig.rays(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1), eye)
@@ -119,7 +121,7 @@ def _points(rig: StereoRig, eye: Eye, seen: EyePasses, far: NDArray[np.bool_]) -
     return points
 
 
-def _matches(rig: StereoRig, eye: Eye, points: Array, far: NDArray[np.bool_], other: EyePasses) -> Matches:
+def _matches(rig: StereoRig, eye: Eye, points: Array, far: NDArray[np.bool_], other: SurfacePasses) -> PixelMatches:
     """Matches of (H, W, 3) points, or directions where they are far, that are given in the frame of the eye."""
     height, width = far.shape
     points = np.where((points[..., 2] > 0)[..., None], points, np.nan)
@@ -134,7 +136,7 @@ def _matches(rig: StereoRig, eye: Eye, points: Array, far: NDArray[np.bool_], ot
     depth_m = np.where(far, np.inf, points[..., 2])
     hidden[inside] = _is_hidden(rig, eye, target[inside], depth_m[inside], other)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-    return Matches(displacement_px=target - pixels, hidden=hidden, outside=known & ~inside)
+    return PixelMatches(displacement_px=target - pixels, hidden=hidden, outside=known & ~inside)
 
 
 def _is_beyond_lens(rig: StereoRig, eye: Eye, ideal_px: Array) -> NDArray[np.bool_]:
@@ -145,7 +147,7 @@ def _is_beyond_lens(rig: StereoRig, eye: Eye, ideal_px: Array) -> NDArray[np.boo
     return beyond
 
 
-def _is_hidden(rig: StereoRig, eye: Eye, target_px: Array, depth_m: Array, other: EyePasses) -> NDArray[np.bool_]:
+def _is_hidden(rig: StereoRig, eye: Eye, target_px: Array, depth_m: Array, other: SurfacePasses) -> NDArray[np.bool_]:
     """(N,) whether the nearest pixel centre sees something nearer than a point, by more than a pixel of its surface.
 
     Args:

@@ -19,7 +19,7 @@ from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.dense_matches import EyePasses, Matches, flow_matches, stereo_matches
+from labelgen.dense_matches import PixelMatches, SurfacePasses, flow_matches, stereo_matches
 from render.analytic_engine.flat_drogue import EyeView, flat_drogue
 from render.analytic_engine.ring_passes import pixel_passes
 from scenes.sampler import sample_frame
@@ -31,9 +31,9 @@ DROGUE_MOVES = exp_twist([0.02, -0.03, -0.15, 0.02, -0.03, 0.01])
 CAMERA_TURNS = exp_twist([0.0, 0.0, 0.0, 0.004, -0.006, 0.003])
 
 
-def passes(frame: FrameSpec, eye: Eye) -> EyePasses:
+def passes(frame: FrameSpec, eye: Eye) -> SurfacePasses:
     drawn = draw_eye(frame, eye)
-    return EyePasses(drawn.part_id, drawn.depth_m, drawn.normal)
+    return SurfacePasses(drawn.part_id, drawn.depth_m, drawn.normal)
 
 
 def moved(frame: FrameSpec, **changes: Any) -> FrameSpec:
@@ -66,7 +66,7 @@ def at(displacement_px: np.ndarray, place_px: np.ndarray) -> np.ndarray:
 
 
 def marker_errors_px(
-    first: FrameSpec, second: FrameSpec, eye: Eye, to: Eye, found: Matches, seen: EyePasses
+    first: FrameSpec, second: FrameSpec, eye: Eye, to: Eye, found: PixelMatches, seen: SurfacePasses
 ) -> list[float]:
     """By marker, distance from where the displacements send its centre to where it is."""
     errors = []
@@ -116,9 +116,9 @@ def test_lenses_bend_matches_as_opencv_s_projection_does() -> None:
     frame = sample_frame(recipe, 0)
     after = moved(frame)
 
-    def flat_passes(frame: FrameSpec, eye: Eye) -> EyePasses:
+    def flat_passes(frame: FrameSpec, eye: Eye) -> SurfacePasses:
         drawn = pixel_passes(flat_drogue(frame.drogue), EyeView(frame.rig, eye, frame.left_from_drogue))
-        return EyePasses(drawn.part_id, drawn.depth_m, drawn.normal)
+        return SurfacePasses(drawn.part_id, drawn.depth_m, drawn.normal)
 
     seen, later = flat_passes(frame, "right"), flat_passes(after, "right")
     found = flow_matches(frame, after, "right", seen, later)
@@ -179,18 +179,20 @@ def test_hidden_pixels_are_those_of_a_finer_z_buffer(frame: FrameSpec, eye: Eye)
     assert (wrong & ~edges[row, column]).sum() < 5
 
 
-def plane(frame: FrameSpec, part: Part, depth_m: float) -> EyePasses:
+def plane(frame: FrameSpec, part: Part, depth_m: float) -> SurfacePasses:
     """A plane of one part, across the axis."""
     camera = frame.rig.camera
     shape = (camera.height_px, camera.width_px)
     normal = np.broadcast_to(np.float32([0, 0, -1]), (*shape, 3))
-    return EyePasses(np.full(shape, part, np.uint8), np.full(shape, depth_m, np.float32), normal)
+    return SurfacePasses(np.full(shape, part, np.uint8), np.full(shape, depth_m, np.float32), normal)
 
 
-def sky(frame: FrameSpec) -> EyePasses:
+def sky(frame: FrameSpec) -> SurfacePasses:
     camera = frame.rig.camera
     shape = (camera.height_px, camera.width_px)
-    return EyePasses(np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.float32))
+    return SurfacePasses(
+        np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.float32)
+    )
 
 
 def test_the_sky_moves_by_the_camera_s_turn(frame: FrameSpec) -> None:
@@ -293,7 +295,7 @@ def test_points_of_a_bending_hose_keep_their_place_on_its_mesh(frame: FrameSpec)
         here = PinholeCamera(1, 1, camera.fx_px, camera.fy_px, camera.cx_px - image[0], camera.cy_px - image[1])
         rig = StereoRig(here, frame.rig.baseline_m)
         first, second = (one.model_copy(update={"rig": rig}) for one in (before, after))
-        seen = EyePasses(np.array([[Part.HOSE]], np.uint8), np.array([[point[2]]]), np.zeros((1, 1, 3), np.float32))
+        seen = SurfacePasses(np.array([[Part.HOSE]], np.uint8), np.array([[point[2]]]), np.zeros((1, 1, 3), np.float32))
         found = flow_matches(first, second, "left", seen, seen).displacement_px[0, 0]
         errors.append(np.linalg.norm(found - here.project(wanted)))
     assert np.linalg.norm(camera.project(new) - place, axis=1).max() > 5

@@ -24,7 +24,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.dense_matches import EyePasses, Matches, flow_matches, stereo_matches
+from labelgen.dense_matches import PixelMatches, SurfacePasses, flow_matches, stereo_matches
 from labelgen.export.export_log import ExportLog, require_pinholes, sequence_name
 from labelgen.export.frame_files import export_image
 
@@ -73,7 +73,7 @@ def write_sintel(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     _require_depth(dataset, source)
     splits = source.manifest.split_of_frame()
     with new_folder(out) as folder:
-        last: tuple[PairRecord, Mapping[Eye, EyePasses]] | None = None
+        last: tuple[PairRecord, Mapping[Eye, SurfacePasses]] | None = None
         place, part = 0, 1
         for record in log.records(source):
             passes = _passes(source, record)
@@ -93,7 +93,7 @@ def write_sintel(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     return [out]
 
 
-def _write_flow(root: Path, name: str, eye: Eye, place: int, found: Matches) -> None:
+def _write_flow(root: Path, name: str, eye: Eye, place: int, found: PixelMatches) -> None:
     path = _file(root, "flow", name, eye, place, "flo")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_flo(np.where(found.known[..., None], found.displacement_px, UNKNOWN_FLOW_PX)))
@@ -116,14 +116,14 @@ def _require_depth(dataset: Location, source: Dataset) -> None:
         )
 
 
-def _passes(source: Dataset, record: PairRecord) -> dict[Eye, EyePasses]:
-    found: dict[Eye, EyePasses] = {}
+def _passes(source: Dataset, record: PairRecord) -> dict[Eye, SurfacePasses]:
+    found: dict[Eye, SurfacePasses] = {}
     for eye in EYES:
         name = passes_file(eye)
         where = source.frames.where(record.frame_index, name)
         planes = read_passes(source.frames.read(record.frame_index, name), where, record.frame.rig.camera)
         normal = np.stack([planes[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
-        found[eye] = EyePasses(source.part_ids(record.frame_index, eye), planes["depth.Z"], normal)
+        found[eye] = SurfacePasses(source.part_ids(record.frame_index, eye), planes["depth.Z"], normal)
     return found
 
 

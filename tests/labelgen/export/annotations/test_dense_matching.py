@@ -16,7 +16,7 @@ from datasets_manifest.storage.writer import encode_files, write_frame
 from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import exp_twist
 from geometry.stereo import EYES
-from labelgen.dense_matches import EyePasses, flow_matches, stereo_matches
+from labelgen.dense_matches import SurfacePasses, flow_matches, stereo_matches
 from labelgen.export.annotations.dense_matching import UNKNOWN_FLOW_PX
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
@@ -65,9 +65,9 @@ def dataset(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Path
     return write_dataset(tmp_path_factory.mktemp("dense") / "dataset", recipe, pairs)
 
 
-def passes(pair: Pair, eye: str) -> EyePasses:
+def passes(pair: Pair, eye: str) -> SurfacePasses:
     seen = getattr(pair.radiance, eye)
-    return EyePasses(seen.part_id, seen.depth_m, seen.normal)
+    return SurfacePasses(seen.part_id, seen.depth_m, seen.normal)
 
 
 def frames(pairs: list[Pair]) -> list[FrameSpec]:
