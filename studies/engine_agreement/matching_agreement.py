@@ -1,4 +1,4 @@
-"""`python -m studies.engine_agreement.matching_agreement`: exported disparity and optical flow against labels and pixels.
+"""`python -m studies.engine_agreement.matching_agreement`: exported disparity and flow against labels and pixels.
 
 Renders three neighbouring pairs of a docking by each engine, exports them, reads the files with OpenCV and compares
 where they send a marker with the label and with the light of the other picture, and every pixel's part id with that of
