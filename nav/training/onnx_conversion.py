@@ -72,8 +72,8 @@ def _traced(network: DetectorNetwork) -> bytes:
 
 Convolution = nn.Conv1d | nn.Conv2d
 
-# Kaiming initialization with fan-in n gives filters of norm sqrt(n * 2/n). A step of AdamW changes a weight by the
-# learning rate, so filters of this norm learn as fast as newly initialized ones.
+# He's initialization with fan-in n gives filters of norm sqrt(n * 2/n). A step of AdamW changes a weight by about the
+# learning rate, so trained filters of this norm change several times more slowly than the small ones of a new network.
 _FILTER_NORM = 2**0.5
 
 
@@ -119,8 +119,8 @@ def import_onnx(content: bytes) -> DetectorNetwork:
 def recalibrate_batch_norm(network: DetectorNetwork, batches: Iterable[Tensor]) -> None:
     """Give batch normalisation the statistics of the convolutions' outputs, without a change of the network's outputs.
 
-    Means and variances become those over the images; scales and offsets compensate for them. Filters are scaled to the
-    norm of newly initialized ones.
+    Means and variances become those over the images; scales and offsets compensate for them. Filters are scaled to one
+    norm.
 
     Args:
         network: from `import_onnx`; its mode is not changed.

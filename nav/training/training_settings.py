@@ -37,6 +37,8 @@ class TrainingSettings(FrozenModel):
         warmup_fraction: of the training, in which the learning rate rises from zero; it then falls along a cosine to
             `floor_fraction` of its peak.
         ema_decay: per step, of the moving average of the weights, which is evaluated and exported.
+        filter_sd: standard deviation of the filters before training; 0 for that of He et al. (arXiv:1502.01852, eq.
+            10), which is 0.06 to 0.5 here, and slower to learn.
         fusion_start: weights with which ASFF begins: `random`, or the same at every location, which are `equal`, or
             `own` with most for the level that is fused into.
         prior_score: of every cell before training.
@@ -75,6 +77,7 @@ class TrainingSettings(FrozenModel):
     warmup_fraction: float = Field(default=0.05, ge=0, le=0.5)
     floor_fraction: float = Field(default=0.01, ge=0, le=1)
     ema_decay: float = Field(default=0.998, ge=0, lt=1)
+    filter_sd: float = Field(default=0.03, ge=0, le=1)
     fusion_start: Literal["random", "equal", "own"] = "random"
     prior_score: float = Field(default=0.01, gt=0, lt=1)
     cells_per_box: int = Field(default=10, ge=1, le=1000)

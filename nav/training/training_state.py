@@ -190,6 +190,8 @@ def new_network(settings: TrainingSettings) -> DetectorNetwork:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         network = DetectorNetwork(config)
+        if settings.filter_sd:
+            network.initialize_filters(settings.filter_sd)
     network.initialize_scores(settings.prior_score)
     network.initialize_fusion(settings.fusion_start)
     return network

@@ -72,9 +72,13 @@ PARTS: dict[str, dict[str, Any]] = {
     "no-mosaic": {"mosaic": False},
     ONE_VIEW: {"views": "one"},
 }
-# How the network learns: one setting changed at a time, first the warm-up of 1,500 passes in a training of 5,184.
+# How the network learns: one setting changed at a time. He's filters were the former ones, and a warm-up of 1,500 passes
+# in a training of 5,184.
 LEARNING: dict[str, dict[str, Any]] = {
     "eca-asff": {},
+    "he-filters": {"filter_sd": 0.0},
+    "small-filters": {"filter_sd": 0.01},
+    "large-filters": {"filter_sd": 0.1},
     "long-warm-up": {"warmup_fraction": 0.289},
     "asff-equal": {"fusion_start": "equal"},
     "asff-own": {"fusion_start": "own"},

@@ -191,6 +191,16 @@ class DetectorNetwork(nn.Module):
             assert isinstance(head, DetectionHead)
             head.initialize_priors()
 
+    def initialize_filters(self, sd: float) -> None:
+        """Draw all filters before batch normalisation with one standard deviation, from torch's generator.
+
+        Their scale does not change what the network computes, but how fast it learns: Adam moves each weight by about
+        the learning rate, whatever its size, so the share of a filter that a step changes is the rate over `sd`.
+        """
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d) and module.bias is None:
+                nn.init.normal_(module.weight, std=sd)
+
     def initialize_scores(self, prior: float) -> None:
         """Let every cell predict nearly this score."""
         for head in self.heads:

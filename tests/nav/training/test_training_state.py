@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from nav.training.training_settings import TrainingSettings
 from nav.training.training_state import (
@@ -153,6 +154,47 @@ def test_a_training_with_muon_resumes_exactly(tmp_path: Path) -> None:
         step(state)
     for one, other in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def filters(network: nn.Module) -> list[nn.Parameter]:
+    """The weights of all convolutions before batch normalisation."""
+    return [each.weight for each in network.modules() if isinstance(each, nn.Conv2d) and each.bias is None]
+
+
+@pytest.mark.parametrize("sd", [0.01, 0.03])
+def test_the_first_step_changes_every_filter_by_the_rate_over_its_standard_deviation(sd: float) -> None:
+    settings = TrainingSettings(variant="s", filter_sd=sd, learning_rate=1e-4, weight_decay=0.0)
+    state = new_state(new_network(settings), settings, ComputeDevice(torch.device("cpu"), bf16=False))
+    before = [each.detach().clone() for each in filters(state.network)]
+    generator = torch.Generator().manual_seed(3)
+    for weights in state.network.parameters():
+        weights.grad = torch.randn(weights.shape, generator=generator)
+    state.optimizer.step()
+    for old, new in zip(before, filters(state.network), strict=True):
+        # AdamW's first step is the rate, with the gradient's sign. The smallest layer has 144 filters' weights, whose
+        # norm is known to 6 % (one standard deviation).
+        change = (new.detach() - old).norm() / old.norm()
+        assert float(change) == pytest.approx(1e-4 / sd, rel=0.25)
+
+
+def test_filters_of_he_have_fewer_large_weights_the_more_inputs_they_have() -> None:
+    network = new_network(TrainingSettings(variant="s", filter_sd=0.0))
+    for weights in filters(network):
+        inputs = weights[0].numel()
+        # The smallest layer has 144 weights: one standard deviation of their own is 6 %.
+        assert float(weights.detach().std()) == pytest.approx((2 / inputs) ** 0.5, rel=0.25)
+
+
+def test_a_checkpoint_from_before_filters_had_a_setting_is_refused(tmp_path: Path) -> None:
+    settings = TrainingSettings(variant="s")
+    state = new_state(new_network(settings), settings, ComputeDevice(torch.device("cpu"), bf16=False))
+    save_state(tmp_path, state, settings, [])
+    content = load_checkpoint(tmp_path / CHECKPOINT_FILE)
+    assert content is not None
+    del content["settings"]["filter_sd"]
+    save_checkpoint(tmp_path / CHECKPOINT_FILE, content)
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: belongs to a training that differs in filter_sd;"):
+        restore_state(tmp_path, state, settings, [])
 
 
 def test_a_checkpoint_from_before_the_warm_up_was_a_share_is_refused_in_one_line(tmp_path: Path) -> None:

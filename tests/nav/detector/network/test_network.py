@@ -254,6 +254,34 @@ def test_fusion_starts_with_the_same_weights_everywhere(start: FusionStart, own:
     assert changed and all("weigh" in name for name in changed)
 
 
+def test_the_scale_of_filters_before_normalisation_does_not_change_what_a_network_computes() -> None:
+    networks = []
+    for sd in (0.1, 0.2):
+        network = make_network(NetworkConfig("s")).train()
+        with torch.random.fork_rng():
+            torch.manual_seed(8)
+            network.initialize_filters(sd)
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eps = 1e-12  # it has to be above 0
+        networks.append(network)
+    filters = [
+        [module.weight.detach() for module in network.modules() if isinstance(module, nn.Conv2d) and module.bias is None]
+        for network in networks
+    ]
+    every = torch.cat([each.flatten() for each in filters[0]])
+    # Of some 500,000 independent normal values the standard deviation is known to 0.1 %.
+    assert float(every.std()) == pytest.approx(0.1, rel=0.005)
+    for one, other in zip(*filters, strict=True):
+        torch.testing.assert_close(2 * one, other)
+    images = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(8))
+    with torch.no_grad():
+        small, large = (network(images) for network in networks)
+    # A factor of two moves exponents only, but products are not summed in one order by all kernels.
+    for one, other in zip(small, large, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
 def test_networks_start_with_the_score_that_they_are_given() -> None:
     with torch.random.fork_rng():
         torch.manual_seed(6)
