@@ -266,7 +266,7 @@ def test_the_scale_of_filters_before_normalisation_does_not_change_what_a_networ
                 module.eps = 1e-12  # it has to be above 0
         networks.append(network)
     filters = [
-        [module.weight.detach() for module in network.modules() if isinstance(module, nn.Conv2d) and module.bias is None]
+        [each.weight.detach() for each in network.modules() if isinstance(each, nn.Conv2d) and each.bias is None]
         for network in networks
     ]
     every = torch.cat([each.flatten() for each in filters[0]])
