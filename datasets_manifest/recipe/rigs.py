@@ -109,6 +109,7 @@ class _RigTable(FrozenModel):
     probe_tip_body_m: tuple[float, float, float] | None = None
     output_bits: int | None = None
     encoding: str | None = None
+    noise_free: bool | None = None
     optics: Optics | None = None
     eyes: Eyes | None = None
 
@@ -180,6 +181,7 @@ def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
             for key, change in (
                 ("output_bits", table.output_bits),
                 ("encoding", table.encoding),
+                ("noise_free", table.noise_free),
                 ("optics", table.optics),
             )
             if change is not None

@@ -100,6 +100,8 @@ class Sensor(FrozenModel):
         black_level_dn: added before the converter clips. [DN of adc_bits]
         encoding: `linear`, or `gamma` (the sRGB curve).
         optics: vignetting and focus.
+        noise_free: whether pictures lack the noise of light and readout and the spread of the pixels' gains, as a twin
+            of noisy ones; labels such as signal-to-noise are those of the noisy sensor.
         band_nm: middle of the near-infrared band that a filter passes to a monochrome sensor, None for the visible; the
             responsivity is then that to sunlight through the filter, by the lux of all sunlight. [nm]
     """
@@ -116,6 +118,8 @@ class Sensor(FrozenModel):
     black_level_dn: int = Field(ge=0, le=1000)
     encoding: Literal["linear", "gamma"] = "linear"
     optics: Optics = Optics()
+    # Left out at its default, so that the hashes of other datasets stay those of earlier versions.
+    noise_free: bool = Field(default=False, exclude_if=lambda noise_free: not noise_free)
     band_nm: float | None = Field(default=None, ge=750, le=1000, exclude_if=lambda band_nm: band_nm is None)
 
     @model_validator(mode="after")

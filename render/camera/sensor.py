@@ -55,12 +55,13 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
         dn_per_e=dn_per_electron(sensor, frame.exposure.gain),
         black_level_dn=sensor.black_level_dn,
         adc_bits=sensor.adc_bits,
+        is_noise_free=sensor.noise_free,
     )
     numbers: dict[Eye, NDArray[np.uint16]] = {}
     for index, eye in enumerate(EYES):
         seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
         light = _sample_sites(seen, frame)
-        gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
+        gains = _pixel_gains(frame.seed, index, light.shape, 0.0 if sensor.noise_free else sensor.prnu_fraction)
         rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
         numbers[eye] = readout.digital_numbers(light, gains, rng)
         mosaics[eye] = _store(numbers[eye], sensor, "linear") if sensor.color == "bayer" else None

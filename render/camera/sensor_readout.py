@@ -27,6 +27,7 @@ class SensorReadout:
         dn_per_e: gain of the converter. [DN/e-]
         black_level_dn: number without light.
         adc_bits: bits of a number.
+        is_noise_free: whether numbers are those of the mean light.
     """
 
     electrons_per_cd_m2: float
@@ -35,6 +36,7 @@ class SensorReadout:
     dn_per_e: float
     black_level_dn: int
     adc_bits: int
+    is_noise_free: bool = False
 
     def digital_numbers(
         self, light: NDArray[np.float32], gains: NDArray[np.float32], rng: np.random.Generator
@@ -47,8 +49,9 @@ class SensorReadout:
             rng: for the noise; its raw bits are used.
         """
         bits = rng.bit_generator.random_raw(-(-light.size // 2)).view(np.uint32)[: light.size]
-        numbers, least_e = self._converted(light.ravel(), gains.ravel(), bits, self.electrons_per_cd_m2, 1.0)
-        if least_e < _POISSON_BELOW_E:
+        shot = 0.0 if self.is_noise_free else 1.0
+        numbers, least_e = self._converted(light.ravel(), gains.ravel(), bits, self.electrons_per_cd_m2, shot)
+        if least_e < _POISSON_BELOW_E and not self.is_noise_free:
             mean_e = light.ravel() * np.float32(self.electrons_per_cd_m2) * gains.ravel()
             dim = mean_e < _POISSON_BELOW_E
             counted_e = rng.poisson(mean_e[dim]).astype(np.float32)
@@ -70,7 +73,8 @@ class SensorReadout:
         numbers = np.empty(light.shape, dtype=np.uint16)
         top = 2**self.adc_bits - 1
         full_dn = min(self.full_well_e * self.dn_per_e, 2.0 * top)
-        scales = (per, shot, self.read_noise_e**2, self.dn_per_e, full_dn, self.black_level_dn + 0.5, float(top))
+        read_noise_e = 0.0 if self.is_noise_free else self.read_noise_e
+        scales = (per, shot, read_noise_e**2, self.dn_per_e, full_dn, self.black_level_dn + 0.5, float(top))
         least_e = _convert_all(light, gains, bits, normal_quantiles(), np.array(scales, dtype=np.float32), numbers)
         return numbers, float(least_e)
 

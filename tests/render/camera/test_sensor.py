@@ -226,3 +226,15 @@ def test_blur_keeps_light_and_place(frame: FrameSpec) -> None:
     assert (seen * u).sum() == pytest.approx(17.0, abs=1e-5)
     # The sampled Gaussian, cut at four sigma, keeps its variance within 0.5 %.
     assert (seen * (u - 17) ** 2).sum() == pytest.approx(0.64, rel=0.005)
+
+
+@pytest.mark.parametrize("electrons", [3.0, 20.0, 4000.0])
+def test_a_noise_free_picture_is_the_mean_of_noisy_ones(frame: FrameSpec, electrons: float) -> None:
+    noisy, quiet = with_sensor(frame), with_sensor(frame, noise_free=True)
+    pattern = flat_pair(level_for(noisy, electrons))
+    numbers = expose(quiet, pattern).left
+    assert numbers.min() == numbers.max()
+    many = expose(noisy, pattern).left.astype(np.float64)
+    # Four standard errors of the mean, and half a number for the rounding of the noise-free one.
+    assert abs(many.mean() - numbers.mean()) < 4 * many.std() / np.sqrt(many.size) + 0.5
+    assert many.std() > 0
