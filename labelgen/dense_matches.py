@@ -156,8 +156,8 @@ def _is_hidden(rig: StereoRig, eye: Eye, target_px: Array, depth_m: Array, other
         depth_m: (N,) their planar depth there, infinite for the background. [m]
         other: its passes.
     """
-    center = np.rint(target_px)
-    column, row = np.clip(center.astype(int), 0, np.array(other.depth_m.shape[::-1]) - 1).T
+    center = np.clip(np.rint(target_px), 0, np.array(other.depth_m.shape[::-1]) - 1)
+    column, row = center.astype(int).T
     there_m, normal = other.depth_m[row, column].astype(np.float64), other.normal[row, column].astype(np.float64)
     shown = np.isfinite(there_m)
     there_m = np.where(shown, there_m, 1.0)
