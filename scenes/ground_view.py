@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -81,6 +83,25 @@ class MipTile:
         self._values = np.concatenate([*levels[self._byte_levels :], np.zeros(0, np.float32)])
         self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
         self.most = float(texels[..., 0].max())
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """The texture whose `to_arrays` these are."""
+        tile = cls.__new__(cls)
+        tile._roots, tile._values, tile.mean = arrays["roots"], arrays["values"], arrays["mean"]
+        tile._side, tile._channels, tile._top, tile._byte_levels = arrays["sizes"].tolist()
+        tile._texel_m, tile.most = arrays["scales"].tolist()
+        return tile
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """All that the texture is, to be kept in a file."""
+        return {
+            "roots": self._roots,
+            "values": self._values,
+            "mean": self.mean,
+            "sizes": np.array([self._side, self._channels, self._top, self._byte_levels]),
+            "scales": np.array([self._texel_m, self.most]),
+        }
 
     def sample(self, x_m: Field, y_m: Field, footprint_m: Field) -> Field:
         """Values averaged approximately over the footprint.

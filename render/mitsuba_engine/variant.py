@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import make_scratch_folder
+from datasets_manifest.user_cache import user_cache_folder
 from render.device import Device, kernel_module
 from render.engine import EngineUnavailableError
 from render.version import RENDER_VERSION
@@ -84,12 +85,7 @@ def llvm_libraries() -> list[Path]:
 
 def verdicts_file() -> Path:
     """Where it is remembered what works; delete the file to try everything again."""
-    try:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:
-        # A user without a home, as containers have: a file that can neither be read nor written.
-        cache = Path(os.devnull)
-    return cache / "droguekit" / "variant-verdicts.json"
+    return user_cache_folder() / "variant-verdicts.json"
 
 
 def _works(library: Path) -> bool:

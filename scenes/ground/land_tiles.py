@@ -9,14 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest import random_streams
 from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.user_cache import kept_arrays
+from geometry import bilinear_sampling
 from geometry.bilinear_sampling import sample_bilinear
+from scenes import ground_view
 from scenes.ground_view import Field, MipTile, power_noise, smooth_noise
 
 LandKind = Literal["fields", "forest", "dry", "town"]
@@ -31,6 +35,10 @@ HEIGHT_SCALE_M = 40.0
 
 _SIZE_PX = 2048
 _TEXELS_M: dict[LandKind, float] = {"fields": 4.0, "forest": 4.0, "dry": 4.0, "town": 2.5}
+# Streams, amplitudes [px] and cycles by which straight lines are bent at last.
+_BENDS: dict[LandKind, tuple[tuple[str, float, float], ...]] = {
+    "fields": (("valleys", 19.0, 5), ("bend", 5.0, 14)), "forest": (), "dry": (), "town": (("town", 7.0, 3),),
+}  # fmt: skip
 _SEED = 4
 _SHADOW_STEPS_PX = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22)
 _CANOPY_SLOPE = 0.55  # trees let light through: slopes of the canopy count by this share
@@ -62,6 +70,10 @@ _LAMP_SPREAD = 0.9  # standard deviation of the logarithm of their intensities
 LAMP_PEAK_CD_M2 = 300.0
 """Radiance of the value 1 of a texture of lamps. [cd/m2]"""
 
+_TILES = ("rgb", "beam", "height")
+# All code that the textures follow from.
+_SOURCES = (__file__, ground_view.__file__, bilinear_sampling.__file__, random_streams.__file__)
+
 
 @dataclass
 class _Canvas:
@@ -72,7 +84,6 @@ class _Canvas:
     rank: Field
     texel_m: float
     lamps_px: list[tuple[float, float]] = field(default_factory=list)
-    bends: tuple[tuple[str, float, float], ...] = ()
 
     def fill(self, area: Rectangle, color: Rgb | NDArray[np.float64], height_m: float = 0.0) -> None:
         x0, y0, x1, y1 = area
@@ -99,36 +110,50 @@ class LandTextures:
         beam: for each of `SUN_TANGENTS` the sun's light on every place over that on level ground, over `BEAM_SCALE`;
             1 on average, weighted with the reflectance. As the fourth channel a rank in [0, 1] that parcels share.
         height: of trees and houses, over `HEIGHT_SCALE_M`.
-        lamps_px: places of street lamps before the texture was bent, and how it was. [px]
+        lamps_px: (N, 2) places of street lamps before the texture was bent. [px]
     """
 
     rgb: MipTile
     beam: MipTile
     height: MipTile
-    lamps_px: tuple[tuple[float, float], ...]
-    bends: tuple[tuple[str, float, float], ...]
+    lamps_px: NDArray[np.float64]
 
 
 @lru_cache(maxsize=4)
 def land_textures(kind: LandKind) -> LandTextures:
-    """Textures of a kind of land, each of the same size and period."""
+    """Textures of a kind of land, each of the same size and period; kept on disk, for painting takes seconds."""
+    kept = kept_arrays(f"land-{kind}", _SOURCES, lambda: _painted(kind))
+    tiles = (
+        MipTile.from_arrays({key.removeprefix(f"{name} "): kept[key] for key in kept if key.startswith(f"{name} ")})
+        for name in _TILES
+    )
+    return LandTextures(*tiles, kept["lamps"])
+
+
+def _painted(kind: LandKind) -> dict[str, NDArray[Any]]:
+    """The arrays of the textures of a kind of land."""
     canvas = _canvas(kind)
     rgb = np.clip(canvas.rgb, 0.0, 1.0)
     beam = np.empty((_SIZE_PX, _SIZE_PX, 4), dtype=np.float32)
     beam[..., :3] = _beam_shares(canvas.height_m, canvas.texel_m, rgb.mean(axis=-1))
     beam[..., 3] = canvas.rank
-    return LandTextures(
-        MipTile(rgb, canvas.texel_m, coded=True),
-        MipTile(np.clip(beam, 0.0, 1.0), canvas.texel_m, coded=True),
-        MipTile(np.clip(canvas.height_m[..., None] / np.float32(HEIGHT_SCALE_M), 0.0, 1.0), canvas.texel_m, coded=True),
-        tuple(canvas.lamps_px),
-        canvas.bends,
-    )
+    height = canvas.height_m[..., None] / np.float32(HEIGHT_SCALE_M)
+    tiles = (MipTile(np.clip(texels, 0.0, 1.0), canvas.texel_m, coded=True) for texels in (rgb, beam, height))
+    arrays = {
+        f"{name} {key}": array
+        for name, tile in zip(_TILES, tiles, strict=True)
+        for key, array in tile.to_arrays().items()
+    }
+    return arrays | {"lamps": np.array(canvas.lamps_px, dtype=np.float64).reshape(-1, 2)}
 
 
 @lru_cache(maxsize=2)
 def lamp_texture(kind: LandKind) -> MipTile:
     """(3 channels) radiance of street lamps at night over `LAMP_PEAK_CD_M2`; colour and intensity differ by lamp."""
+    return MipTile.from_arrays(kept_arrays(f"lamps-{kind}", _SOURCES, lambda: _lit(kind).to_arrays()))
+
+
+def _lit(kind: LandKind) -> MipTile:
     land, texel_m = land_textures(kind), _TEXELS_M[kind]
     rng = frame_generator(_SEED, 0, f"lamps {kind}")
     light = np.zeros((_SIZE_PX, _SIZE_PX, 3), dtype=np.float32)
@@ -145,7 +170,7 @@ def lamp_texture(kind: LandKind) -> MipTile:
     # Half of the light comes from the street around the lamp.
     pool = cv2.GaussianBlur(light, (0, 0), 5.0 / texel_m)
     light = 0.4 * light + 0.6 * pool
-    for bend in land.bends:
+    for bend in _BENDS[kind]:
         light = _bent(light, *bend)
     light *= np.float32(1.0 / LAMP_PEAK_CD_M2)
     # Clipping, bending and eight bits take some light: the rest makes up for it.
@@ -166,6 +191,11 @@ def _canvas(kind: LandKind) -> _Canvas:
         _TEXELS_M[kind],
     )
     paint(empty, frame_generator(_SEED, 0, f"paint {kind}"))
+    for bend in _BENDS[kind]:
+        stack = np.concatenate([empty.rgb, empty.height_m[..., None]], axis=-1)
+        bent = _bent(stack, *bend)
+        empty.rgb, empty.height_m = bent[..., :3].copy(), bent[..., 3].copy()
+        empty.rank = _bent(empty.rank, *bend)
     return empty
 
 
@@ -210,15 +240,6 @@ def _bent(canvas: Field, stream: str, amplitude_px: float, cycles: float) -> Fie
     size = np.float32(_SIZE_PX)
     bent: Field = sample_bilinear(canvas, np.mod(u, size), np.mod(v, size), cv2.BORDER_WRAP)
     return bent
-
-
-def _bend(canvas: _Canvas, *bends: tuple[str, float, float]) -> None:
-    canvas.bends = bends
-    for bend in bends:
-        stack = np.concatenate([canvas.rgb, canvas.height_m[..., None]], axis=-1)
-        bent = _bent(stack, *bend)
-        canvas.rgb, canvas.height_m = bent[..., :3].copy(), bent[..., 3].copy()
-        canvas.rank = _bent(canvas.rank, *bend)
 
 
 def _parcels(
@@ -314,7 +335,6 @@ def _paint_fields(canvas: _Canvas, rng: np.random.Generator) -> None:
     wood *= np.clip(1.6 + gaps, 0.0, 1.0)
     wood = _bent(wood, "fringe", 2.0, 170)
     _plant(canvas, wood, "crowns")
-    _bend(canvas, ("valleys", 19.0, 5), ("bend", 5.0, 14))
 
 
 def _plant(canvas: _Canvas, wood: Field, stream: str, height_m: float = 13.0) -> None:
@@ -458,7 +478,6 @@ def _paint_town(canvas: _Canvas, rng: np.random.Generator) -> None:
     trees = ((_noise("street trees", 1.0, 420) + 2.2 * wood) > 1.75) & (canvas.height_m < 1.0)
     _plant(canvas, cv2.GaussianBlur(trees.astype(np.float32), (0, 0), 0.7), "town crowns", 8.0)
     canvas.rgb *= (1.0 + 0.07 * _noise("wear", 1.4, 80))[..., None]
-    _bend(canvas, ("town", 7.0, 3))
 
 
 def _industry(canvas: _Canvas, rng: np.random.Generator, block: Rectangle) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform, skew
@@ -310,4 +310,4 @@ def flip_probability(tilt: float, tilt_scale: float) -> float:
 
     Source: the two fits differ by the tilt's part along the axis, whose estimate is normal about the true value.
     """
-    return float(norm.sf(tilt / tilt_scale))
+    return float(ndtr(-tilt / tilt_scale))

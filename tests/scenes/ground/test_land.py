@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer
 from scenes.environment_radiance import EnvironmentRadiance
+from scenes.ground import land_tiles
 from scenes.ground.ground_radiance import Ground
 from scenes.ground.land_tiles import (
     BEAM_SCALE,
@@ -19,7 +23,7 @@ from scenes.ground.land_tiles import (
     land_textures,
 )
 from scenes.ground.terrain import Terrain
-from scenes.ground_view import pixel_angle_rad
+from scenes.ground_view import MipTile, pixel_angle_rad
 from scenes.sky.photometry import luminance
 from tests.scenes.ground.test_ground import environment, light, rays
 
@@ -73,7 +77,7 @@ def test_lamps_send_out_their_light_at_every_distance(kind: LandKind) -> None:
 
 
 def test_land_without_lamps_is_dark() -> None:
-    assert not land_textures("forest").lamps_px
+    assert not land_textures("forest").lamps_px.size
     assert not lamp_texture("forest").sample(*everywhere(2048 * 4.0, 64, 40.0)).any()
 
 
@@ -150,3 +154,28 @@ def test_clouds_shade_the_ground_and_keep_its_mean_light() -> None:
     # Some hundred clouds, each as likely as not; those of a dome cover less at the height of the shadow.
     assert sunny.min() < 0.1 and sunny.mean() == pytest.approx(1.0, abs=0.25)
     assert (Ground(environment("fields"), light())._sunny(x, y) == 1.0).all()
+
+
+def test_kept_textures_are_those_that_were_painted() -> None:
+    rng = np.random.default_rng(5)
+    painted = MipTile(rng.random((64, 64, 3), dtype=np.float32), 3.0, coded=True)
+    kept = MipTile.from_arrays(painted.to_arrays())
+    for width_m in (1.0, 12.0, 150.0):
+        places = everywhere(200.0, 70, width_m)
+        assert np.array_equal(kept.sample(*places), painted.sample(*places))
+    assert (kept.most, *kept.mean) == (painted.most, *painted.mean)
+
+
+def test_kept_textures_know_all_code_that_they_follow_from() -> None:
+    """The cache itself, and what is compiled to look at textures, change nothing of them."""
+    top = Path(land_tiles.__file__).parents[2]
+    others = {top / name for name in ("datasets_manifest/user_cache.py", "geometry/compiled_loops.py")}
+    found, waiting = set(others), {Path(land_tiles.__file__)}
+    while waiting:
+        found.add(path := waiting.pop())
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = (node.module, *(f"{node.module}.{alias.name}" for alias in node.names))
+                paths = {top / f"{name.replace('.', '/')}.py" for name in names}
+                waiting |= {each for each in paths - found if each.exists()}
+    assert found - others == {Path(source) for source in land_tiles._SOURCES}
