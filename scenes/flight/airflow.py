@@ -1,4 +1,4 @@
-"""The moving air around hose and receiver: Dryden turbulence, and the bow wave of the receiver's nose.
+"""The moving air around hose and receiver: Dryden turbulence.
 
 Turbulence is a frozen field flown through at constant speed. Gusts are drawn on a time grid of their own by the exact
 discretisation of the shaping filters, so that neither their spectrum nor their values depend on the time step of the
@@ -155,23 +155,3 @@ def spectrum(turbulence: Dryden, airspeed_m_s: float, angular_rate_rad_s: ArrayL
         else:
             densities.append(sd**2 * lag / np.pi * (1 + 3 * x2) / (1 + x2) ** 2)
     return np.stack(densities)
-
-
-def bow_wave(points_m: Array, source_m: Array, airspeed_m_s: float, body_radius_m: float) -> Array:
-    """Velocity that a round nose adds to the air.
-
-    Args:
-        points_m: (3, S, M) points in the air. [m]
-        source_m: (3, S) positions of the sources, half a radius behind the tips of the noses. [m]
-        airspeed_m_s: of the receiver. [m/s]
-        body_radius_m: radius of the body far behind its nose. [m]
-
-    Returns:
-        (3, S, M) `V a^2 / 4 r / |r|^3`; inside the body at most the airspeed, its value at the tip. [m/s]
-
-    Source: Rankine's half-body, a point source in a uniform stream; Milne-Thomson, Theoretical Hydrodynamics, ch. 15.
-    """
-    away = points_m - source_m[..., None]
-    square = np.maximum(np.einsum("ism,ism->sm", away, away), (body_radius_m / 2) ** 2)
-    added_m_s: Array = (airspeed_m_s * body_radius_m**2 / 4) * away / (square * np.sqrt(square))
-    return added_m_s

@@ -30,12 +30,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg.lapack import dgtsv
 from scipy.optimize import brentq, root
 
 from datasets_manifest.recipe.sequence_ranges import HoseParameters
 from datasets_manifest.types.field_types import Range
 from geometry.se3 import Array, angles_from_axis, rotation_from_angles
+from scenes.flight.hose_step import GRAVITY_M_S2, advance
 
 HOSE_LINKS = 36
 # Stiff fittings of two links each hold the hose along the axes of the exit and of the coupling.
@@ -240,7 +240,6 @@ class _Balance:
 
 LINKS = 16
 TIME_STEP_S = 0.002
-GRAVITY_M_S2 = 9.80665  # standard gravity
 # Weight of the relative wind in the drogue's direction; the rest is the last link's. Our reconstruction.
 _WIND_SHARE = 0.7
 _LAG_S = 0.15
@@ -288,9 +287,7 @@ class HoseModel:
         self._drogue = half_density * np.pi / 4 * hose.drogue_diameter_m**2 * hose.drogue_drag_coefficient
         inverse = 1.0 / masses
         self._inverse_masses = inverse
-        # One tridiagonal system for all sequences, separated by zeros.
-        self._diagonal = np.tile(inverse + np.concatenate([[0.0], inverse[:-1]]), sequences)
-        self._beside = np.tile(np.concatenate([inverse[:-1], [0.0]]), sequences)[:-1]
+        self._both_inverses = inverse + np.concatenate([[0.0], inverse[:-1]])
         self._sequences = sequences
 
     def equilibrium(self) -> HoseState:
@@ -354,18 +351,6 @@ class HoseModel:
         drag: Array = (self._across * speed) * normal + (self._along * np.abs(along)) * tangential
         return drag
 
-    def forces(self, state: HoseState, air_m_s: Array) -> Array:
-        """(3, S, N) drag and weight of the nodes beyond the pod; arguments as `step`. [N]"""
-        between = state.nodes_m[..., 1:] - state.nodes_m[..., :-1]
-        past = air_m_s - state.velocities_m_s
-        half_drag = 0.5 * self._link_drag(between / self.link_m, 0.5 * (past[..., 1:] + past[..., :-1]))
-        force: Array = half_drag.copy()
-        force[..., :-1] += half_drag[..., 1:]
-        at_drogue = past[..., -1]
-        force[..., -1] += self._drogue * np.sqrt((at_drogue * at_drogue).sum(axis=0)) * at_drogue
-        force[2] -= GRAVITY_M_S2 * self.masses_kg
-        return force
-
     def step(self, state: HoseState, air_m_s: Array, pod_m: Array, time_step_s: float) -> None:
         """Advance a state by one step of semi-implicit Euler, with tensions that keep the links' lengths at its end.
 
@@ -375,50 +360,14 @@ class HoseModel:
             pod_m: (3, S) position of the pod's exit at the end of the step. [m]
             time_step_s: [s]
         """
-        nodes, velocities = state.nodes_m, state.velocities_m_s
-        u = (nodes[..., 1:] - nodes[..., :-1]) / self.link_m
-        # Positions of the nodes with the tensions of the previous step.
-        pull = state.tensions_n * u
-        force = self.forces(state, air_m_s) - pull
-        force[..., :-1] += pull[..., 1:]
-        velocity = velocities[..., 1:] + (time_step_s * self._inverse_masses) * force
-        place = np.empty_like(nodes)
-        place[..., 0] = pod_m
-        place[..., 1:] = nodes[..., 1:] + time_step_s * velocity
-        change = self._tension_change(u, place[..., 1:] - place[..., :-1], time_step_s)
-        state.tensions_n += change
-        pull = change * u
-        force = -pull
-        force[..., :-1] += pull[..., 1:]
-        correction = (time_step_s * self._inverse_masses) * force
-        velocities[..., 1:] = velocity + correction
-        velocities[..., 0] = (pod_m - nodes[..., 0]) / time_step_s
-        place[..., 1:] += time_step_s * correction
-        nodes[...] = place
-
-    def _tension_change(self, u: Array, ahead: Array, time_step_s: float) -> Array:
-        """(S, N) change of the tensions that restores the links' lengths at the end of the step. [N]
-
-        One step of Newton's method on the squared lengths: its error is of second order in a change that is itself
-        small, and the next step removes it.
-
-        Args:
-            u: (3, S, N) directions in which the tensions pull.
-            ahead: (3, S, N) vectors of the links at the end of the step without the change. [m]
-            time_step_s: [s]
-        """
-        excess = np.einsum("isn,isn->sn", ahead, ahead) - self.link_m**2
-        own = np.einsum("isn,isn->sn", ahead, u)
-        before, after = np.zeros_like(own), np.zeros_like(own)
-        before[:, 1:] = np.einsum("isn,isn->sn", ahead[..., 1:], u[..., :-1])
-        after[:, :-1] = np.einsum("isn,isn->sn", ahead[..., :-1], u[..., 1:])
-        _, _, _, change, _ = dgtsv(
-            -self._beside * before.ravel()[1:],
-            self._diagonal * own.ravel(),
-            -self._beside * after.ravel()[:-1],
-            excess.ravel() / (2 * time_step_s**2),
+        advance(
+            (state.nodes_m, state.velocities_m_s, state.tensions_n),
+            air_m_s,
+            pod_m,
+            (self.masses_kg, self._inverse_masses, self._both_inverses),
+            (self._across, self._along, self._drogue),
+            (self.link_m, self.link_m**2, time_step_s, 2 * time_step_s**2),
         )
-        return np.asarray(change).reshape(own.shape)
 
     def energy_j(self, state: HoseState) -> Array:
         """(S,) kinetic and potential energy of all nodes beyond the pod. [J]"""

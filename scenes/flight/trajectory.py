@@ -26,7 +26,8 @@ from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import DropoutKind
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
+from scenes.flight.airflow import GUST_PERIOD_S
+from scenes.flight.hose_step import air_at_nodes
 from scenes.flight.towed_hose import LINKS, TIME_STEP_S, HoseModel, HoseState, mouth_directions
 
 
@@ -242,14 +243,16 @@ def simulate(
     still = model.equilibrium()
     state = model.equilibrium() if release_m is None else _released_hose(hose, release_m, sequences)
     times = time_step_s * np.arange(samples * substeps + 1)
-    pod_m = np.broadcast_to(inputs.pod_m(times)[..., None], (len(times), 3, sequences))
+    pod_m = np.repeat(inputs.pod_m(times)[..., None], sequences, axis=-1)
     state.nodes_m += pod_m[0][..., None]
     hanging_m = still.nodes_m[..., -1]
     begin_m = hanging_m if inputs.follower.bandwidth_hz == 0 else state.nodes_m[..., -1]
     guidance = Guidance(inputs.follower, GUST_PERIOD_S, begin_m + inputs.from_drogue_m[0])
     closing_m_s = np.gradient(inputs.from_drogue_m, GUST_PERIOD_S, axis=0)
     gusts = np.concatenate([inputs.gusts_m_s, inputs.gusts_m_s[-1:]])
-    nodes, past, eyes = [], [], []
+    nodes, past, eyes, air = [], [], [], np.empty_like(state.nodes_m)
+    bow = (hose.airspeed_m_s * inputs.body_radius_m**2 / 4, (inputs.body_radius_m / 2) ** 2)
+    nose_m = inputs.nose_source_m[:, None]
     for k in range(samples):
         if inputs.follower.bandwidth_hz == 0:
             guidance.position_m = hanging_m + inputs.from_drogue_m[k]
@@ -259,11 +262,8 @@ def simulate(
         for step in range(substeps):
             share = step / substeps
             gust = gusts[k] + share * (gusts[k + 1] - gusts[k])
-            air = np.repeat(gust[..., None], LINKS + 1, axis=-1)
-            air[0] += hose.airspeed_m_s
-            if inputs.body_radius_m > 0:
-                source = guidance.position_after(share * GUST_PERIOD_S) + inputs.nose_source_m[:, None]
-                air += bow_wave(state.nodes_m, source, hose.airspeed_m_s, inputs.body_radius_m)
+            source = guidance.position_after(share * GUST_PERIOD_S) + nose_m
+            air_at_nodes(state.nodes_m, gust, hose.airspeed_m_s, source, bow, air)
             if step == 0:
                 nodes.append(state.nodes_m.copy())
                 past.append(air[..., -1] - state.velocities_m_s[..., -1])

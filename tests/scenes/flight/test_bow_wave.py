@@ -6,18 +6,25 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.sequence_ranges import Follower, HoseParameters, Receiver, SequenceRanges
-from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
+from scenes.flight.airflow import GUST_PERIOD_S
+from scenes.flight.hose_step import air_at_nodes
 from scenes.flight.trajectory import SimulationInputs, simulate
 
 
+def air_m_s(place_m: tuple[float, float, float], radius_m: float) -> np.ndarray:
+    """(3,) velocity of the air at a place about a source at the origin, where 120 m/s come from ahead of the nose."""
+    air = np.empty((3, 1, 1))
+    bow = (120.0 * radius_m**2 / 4, (radius_m / 2) ** 2)
+    air_at_nodes(np.array(place_m).reshape(3, 1, 1), np.zeros((3, 1)), 120.0, np.zeros((3, 1)), bow, air)
+    return air[:, 0, 0]
+
+
 def test_bow_wave_of_a_half_body() -> None:
-    source = np.zeros((3, 1))
-    points = np.array([[[0.9]], [[0.0]], [[0.0]]])
     # V a^2 / 4 r^2 by hand: 120 x 0.25 / 4 / 0.81 = 9.26 m/s, straight away from the source.
-    np.testing.assert_allclose(bow_wave(points, source, 120.0, 0.5)[:, 0, 0], [9.259, 0, 0], atol=1e-3)
-    # A stream of V against it comes to rest at the tip, half a radius ahead.
-    tip = np.array([[[-0.25]], [[0.0]], [[0.0]]])
-    assert bow_wave(tip, source, 120.0, 0.5)[0, 0, 0] == pytest.approx(-120.0)
+    np.testing.assert_allclose(air_m_s((0.9, 0.0, 0.0), 0.5), [129.259, 0, 0], atol=1e-3)
+    # The stream comes to rest at the tip, half a radius ahead.
+    np.testing.assert_allclose(air_m_s((-0.25, 0.0, 0.0), 0.5), 0.0, atol=1e-12)
+    assert air_m_s((-0.25, 0.0, 0.0), 0.0).tolist() == [120.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(("radius_m", "beside_and_behind_m", "abeam_m"), [(0.5, 0.19, 0.34), (0.15, 0.02, 0.05)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.sequence_ranges import HOSES, Follower, HoseParameters
+from scenes.flight import hose_step
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.towed_hose import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
 from scenes.flight.trajectory import SimulationInputs, simulate
@@ -212,3 +213,21 @@ def test_drogue_swings_as_far_as_it_should(severity: str, sd_m: float) -> None:
     across = nodes[:, 1:, :, -1].std(axis=(0, 2))
     # The project's acceptance values, over 2200 s; sideways and vertical, for along the hose it can hardly move.
     np.testing.assert_allclose(across, sd_m, rtol=0.15)
+
+
+def test_tensions_solve_their_system() -> None:
+    """Against a general solver; the last system's rows must change places, as their diagonal is small."""
+    rng = np.random.default_rng(3)
+    for bent, scale in ((0.2, 1.0), (1.0, 1.0), (1.0, 0.05)):
+        links = rng.normal(size=(3, 1)) + bent * rng.normal(size=(3, LINKS))
+        u = links / np.linalg.norm(links, axis=0)
+        ahead = scale * u + 0.3 * rng.normal(size=u.shape)
+        inverse = rng.uniform(0.5, 2.0, LINKS)
+        both = inverse + np.append(0.0, inverse[:-1])
+        change = np.empty(LINKS)
+        hose_step._restore_lengths(u, ahead, (1 / inverse, inverse, both), (1.0, 1.0, 0.1, 0.02), change)
+        system = np.diag(both * (ahead * u).sum(axis=0))
+        system += np.diag(-inverse[:-1] * (ahead[:, 1:] * u[:, :-1]).sum(axis=0), -1)
+        system += np.diag(-inverse[:-1] * (ahead[:, :-1] * u[:, 1:]).sum(axis=0), 1)
+        expected = np.linalg.solve(system, ((ahead**2).sum(axis=0) - 1.0) / 0.02)
+        np.testing.assert_allclose(change, expected, rtol=1e-9 * np.linalg.cond(system))
