@@ -47,7 +47,7 @@ def kept_arrays(name: str, sources: Iterable[str], make: Callable[[], Mapping[st
     folder = user_cache_folder() / "arrays"
     path = folder / f"{name}-{_digest(tuple(sources))}.npz"
     # Zip files carry checksums of their members, which are compared as they are read.
-    with suppress(*_OF_DAMAGED_FILES), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+    with suppress(*_OF_DAMAGED_FILES), path.open("rb") as stream, np.load(stream, allow_pickle=False) as kept:
         return {key: kept[key] for key in kept.files}
     made = dict(make())
     with suppress(OSError):

@@ -123,11 +123,11 @@ class LandTextures:
 def land_textures(kind: LandKind) -> LandTextures:
     """Textures of a kind of land, each of the same size and period; kept on disk, for painting takes seconds."""
     kept = kept_arrays(f"land-{kind}", _SOURCES, lambda: _painted(kind))
-    tiles = (
+    rgb, beam, height = (
         MipTile.from_arrays({key.removeprefix(f"{name} "): kept[key] for key in kept if key.startswith(f"{name} ")})
         for name in _TILES
     )
-    return LandTextures(*tiles, kept["lamps"])
+    return LandTextures(rgb, beam, height, kept["lamps"])
 
 
 def _painted(kind: LandKind) -> dict[str, NDArray[Any]]:
