@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from datasets_manifest.atomic import open_bytes_atomic
 
 _OF_DAMAGED_FILES = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError)
 
-Arrays = dict[str, NDArray[np.generic]]
+Arrays = dict[str, NDArray[Any]]
 
 
 def user_cache_folder() -> Path:
@@ -34,7 +35,7 @@ def user_cache_folder() -> Path:
     return folder / "droguekit"
 
 
-def kept_arrays(name: str, sources: Iterable[str], make: Callable[[], Mapping[str, NDArray[np.generic]]]) -> Arrays:
+def kept_arrays(name: str, sources: Iterable[str], make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
     """Arrays from the user's cache, or made and then kept there.
 
     A file that is damaged, or of other code, is made anew. Where nothing can be written nothing is kept.
