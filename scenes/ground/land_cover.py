@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import Environment, GroundKind
+from scenes.ground.land_painting import LandKind
 from scenes.ground.land_tiles import (
     BEAM_SCALE,
     HEIGHT_SCALE_M,
     LAMP_PEAK_CD_M2,
     SUN_TANGENTS,
-    LandKind,
     lamp_texture,
     land_textures,
 )

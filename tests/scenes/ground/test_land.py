@@ -12,12 +12,12 @@ from datasets_manifest.types.environment import CloudLayer
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.ground import land_tiles
 from scenes.ground.ground_radiance import Ground
+from scenes.ground.land_painting import LandKind
 from scenes.ground.land_tiles import (
     BEAM_SCALE,
     LAMP_CD,
     LAMP_PEAK_CD_M2,
     SUN_TANGENTS,
-    LandKind,
     _beam_shares,
     lamp_texture,
     land_textures,
