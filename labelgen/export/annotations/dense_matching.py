@@ -69,7 +69,7 @@ def write_sintel(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """
     source = Dataset(dataset)
     if source.manifest.recipe.sequence is None:
-        raise ValueError(f"{dataset}: has single pairs, which nothing moves between; flow is for recipes of [sequence]")
+        raise ValueError(f"{dataset}: has single pairs, which nothing moves between; flow needs a recipe of [sequence]")
     _require_depth(dataset, source)
     splits = source.manifest.split_of_frame()
     with new_folder(out) as folder:
