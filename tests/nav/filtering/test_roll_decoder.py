@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.estimates import Feature, PoseEstimate
 from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
@@ -13,6 +14,8 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_rotation
 from geometry.stereo import EYES, StereoRig
 from nav.filtering.roll_decoder import DecodedRoll, RollDecoder, likelihoods, with_decoded_roll
+from nav.runner import add_smoothed, open_navigator
+from nav.sequence_navigator import SequenceSettings
 
 COUNT, PERIOD_S = 12, 0.04
 CHASE = tuple("".join("01"[slot != lamp] for slot in range(COUNT)) for lamp in range(COUNT))
@@ -51,6 +54,10 @@ def pair(drogue: DrogueParameters, true_pose: RigidTransform, index: int, contra
             view += contrast * (0.5 + 0.5 * share) * np.exp(-((x - column) ** 2 + (y - row) ** 2) / 2)
         views.append(np.clip(view, 0, 4095).astype(np.uint16))
     return StereoImages(views[0], views[1], index * PERIOD_S, 0.002, bits=12)
+
+
+def blind_pair(drogue: DrogueParameters, true_pose: RigidTransform, index: int) -> BlindPair:
+    return BlindPair(index, pair(drogue, true_pose, index), RIG, drogue)
 
 
 def roll_error_deg(found: RigidTransform, truth: RigidTransform) -> float:
@@ -125,3 +132,22 @@ def test_markers_keep_their_places_when_the_pose_is_turned() -> None:
     for feature in turned.features:
         assert isinstance(feature.index, int)
         assert np.allclose(places[feature.index], feature.center_px, atol=1e-9)
+
+
+def test_a_navigated_flight_has_the_true_roll_measured_filtered_and_smoothed() -> None:
+    drogue = lamps(CHASE)
+    poses = [pose(100.0 + 2.0 * index, 3.0 - 0.02 * index) for index in range(6)]
+    settings = SequenceSettings(("joint",), filtered=True, smoothed=True)
+    navigator = open_navigator(settings, "peak-ring")
+    pairs = [navigator.process(blind_pair(drogue, true_pose, index)) for index, true_pose in enumerate(poses)]
+    estimates = list(add_smoothed(pairs, settings))
+    assert [estimate.method for estimate in estimates].count("joint+smoother") == 6
+    for estimate in estimates:
+        assert isinstance(estimate, PoseEstimate) and estimate.roll_probability is not None
+        assert estimate.roll_probability > 0.95
+        # A wrong turn is off by 30 degrees; spots of noisy light tell the roll to tenths.
+        assert abs(roll_error_deg(estimate.left_from_drogue, poses[estimate.frame_index])) < 1
+        places = RIG.image(poses[estimate.frame_index].apply(drogue.marker_centers_m), "left")
+        for feature in estimate.features:
+            if feature.eye == "left" and isinstance(feature.index, int):
+                assert np.linalg.norm(places[feature.index] - feature.center_px) < 1
