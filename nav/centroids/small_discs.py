@@ -9,7 +9,6 @@ information (the Cramer-Rao bound) at the noise that the residuals show, widened
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +16,13 @@ from scipy.optimize import nnls
 
 from datasets_manifest.types.images import StereoImages
 from geometry.se3 import Array
-from geometry.stereo import EYES
 from nav.centroids.centroid_uncertainty import NoiseModel, widen_for_nonlinearity
 from nav.centroids.disc_coverage import SpreadDiscs, spread_discs, spread_ring_shares
+from nav.centroids.disc_windows import DiscWindows, cut_windows
 from nav.centroids.discs import DiscFits
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.face_background import FaceBackground
 from nav.centroids.pixel_response import reduced_equations
-from nav.matching.marker_channel import linear_light
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
 
@@ -32,8 +30,6 @@ EDGELESS_RADIUS_PX = 1.5
 """Smaller discs have no pixels that show one side of their edge only, which the edge model needs. [px]"""
 LARGEST_SMALL_RADIUS_PX = 3.0
 """Up to this radius, discs that the edge model does not fit are fitted here. [px]"""
-# Margin of a window around a disc. [px]
-_MARGIN_PX = 3.5
 # Pixels that get more of their light from beyond the face are left out, unless they get light of the disc.
 _MOST_BEYOND, _OWN_PX = 0.5, 2.0
 # Spread of the light by lens and pixels: the first guess, the limits, and the largest step between two fits. [px]
@@ -66,35 +62,6 @@ _TURNS, _STEPS, _SMALL_STEP_PX = 3, 8, 0.002
 # Smaller discs may lie within one pixel.
 _FLAT_RADIUS_PX = 0.7
 _GRID_PX = np.arange(-0.6, 0.61, 0.2)
-# Bayer's cell RGGB: the class of the site at the row's and the column's parity.
-_SITES = np.array([[0, 1], [1, 2]])
-
-
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """Windows of pixels around N discs, all of one size.
-
-    Attributes:
-        values: (N, K) light above the black level. [DN]
-        present: (N, K) 1 for samples that are used, 0 for clipped ones and those beyond the image.
-        classes: (N, C, K) 1 where a sample is of that colour.
-        x_px, y_px: (N, K) places from `middles_px`.
-        middles_px: (N, 2) middle pixels of the windows.
-        half: windows have 2 half + 1 pixels a side; K is their number, or three times that in a colour image.
-    """
-
-    values: Array32
-    present: Array32
-    classes: Array32
-    x_px: Array32
-    y_px: Array32
-    middles_px: Array
-    half: int
-
-    def samples(self, pictures: Array) -> Array32:
-        """(M, K) samples of pictures (M, W, W), the same in every colour."""
-        flat = pictures.reshape(len(pictures), -1).astype(np.float32)
-        return np.ascontiguousarray(np.tile(flat, (1, self.values.shape[1] // flat.shape[1])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +75,8 @@ class _Fit:
         pixels: K.
         share: (N,) of the disc's light in samples that are used.
         loss: twice the negative logarithm of the evidence (Laplace's approximation), to choose the kind of spread by.
+        places_px: (N, 2) from the window's middle.
+        cov_px2: (N, 2, 2) of the places.
     """
 
     minimum: Minimum
@@ -116,6 +85,8 @@ class _Fit:
     pixels: int
     share: Array
     loss: float
+    places_px: Array
+    cov_px2: Array
 
 
 def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground | None = None) -> DiscFits:
@@ -129,7 +100,7 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
     Returns:
         Centres with covariances, or reasons. Shapes are the given ones.
     """
-    windows = _cut_windows(images, discs)
+    windows = cut_windows(images, discs)
     fit = min((_fit(windows, discs, face, cells) for cells in _CELLS), key=lambda fit: fit.loss)
     parameters, cov = fit.minimum.parameters, fit.minimum.covariance()
     chi2 = _chi2(fit)
@@ -138,9 +109,9 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
     light, light_cov = parameters[:, 2 : 2 + colors], cov[:, 2 : 2 + colors, 2 : 2 + colors]
     # The light of all colours together, against its own uncertainty.
     strength = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", light, np.linalg.pinv(light_cov), light), 0) / inflation)
-    centers = windows.middles_px + parameters[:, :2]
+    centers = windows.middles_px + fit.places_px
     moved = np.hypot(*(centers - discs.centers_px).T)
-    center_cov = widen_for_nonlinearity(cov[:, :2, :2] * inflation[:, None, None])
+    center_cov = widen_for_nonlinearity(fit.cov_px2 * inflation[:, None, None])
     sigma_px = np.sqrt(np.einsum("nii->n", center_cov) / 2)
     tests = (
         (fit.share < _LEAST_SHARE, "cut by the edge of the image, or clipped: brighter than the sensor's range"),
@@ -173,44 +144,7 @@ def _chi2(fit: _Fit) -> Array:
     return mean
 
 
-def _cut_windows(images: StereoImages, discs: Ellipses) -> _Windows:
-    half = int(np.ceil(discs.radii_px.max() + _MARGIN_PX))
-    offsets = np.arange(-half, half + 1)
-    middles = np.rint(discs.centers_px).astype(np.int64)
-    columns, rows = middles[:, :1] + offsets, middles[:, 1:] + offsets
-    width, height = images.size_px
-    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
-    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
-    parts = []
-    for index in np.unique(discs.eyes):
-        mine = np.flatnonzero(discs.eyes == index)
-        left, top = int(columns[mine].min()), int(rows[mine].min())
-        window = left, top, int(columns[mine].max()) + 1, int(rows[mine].max()) + 1
-        light, clipped = linear_light(images, EYES[index], window)
-        place = rows[mine][:, :, None] - top, columns[mine][:, None, :] - left
-        parts.append(
-            (mine, light[place], inside[mine].reshape(inside[mine].shape + (1,) * (light.ndim - 2)) & ~clipped[place])
-        )
-    order = np.argsort(np.concatenate([mine for mine, _, _ in parts]))
-    values, present = (_by_color(np.concatenate([part[place] for part in parts])[order]) for place in (1, 2))
-    if images.left_mosaic is not None:
-        site = _SITES[rows[:, :, None] % 2, columns[:, None, :] % 2].reshape(len(discs), 1, -1)
-        classes = (site == np.arange(_SITES.max() + 1)[:, None]).astype(np.float32)
-    else:
-        planes = values.shape[1] // len(offsets) ** 2
-        one = np.repeat(np.eye(planes, dtype=np.float32), len(offsets) ** 2, axis=1)
-        classes = np.broadcast_to(one, (len(discs), *one.shape))
-    y, x = (np.broadcast_to(each, (len(discs), *each.shape)) for each in np.meshgrid(offsets, offsets, indexing="ij"))
-    empty = _Windows(values, present.astype(np.float32), classes, values, values, middles.astype(np.float64), half)
-    return replace(empty, x_px=empty.samples(x), y_px=empty.samples(y))
-
-
-def _by_color(pixels: NDArray[Any]) -> NDArray[Any]:
-    """(N, K) samples of windows (N, W, W) or (N, W, W, 3), one colour after the other."""
-    return np.ascontiguousarray(np.moveaxis(pixels, 3, 1) if pixels.ndim == 4 else pixels).reshape(len(pixels), -1)
-
-
-def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells: int) -> _Fit:
+def _fit(windows: DiscWindows, discs: Ellipses, face: FaceBackground | None, cells: int) -> _Fit:
     """Fit all discs by one kind of spread; its width, neighbours' light and the noise follow from the fits before."""
     centers, sigma_px, variances = discs.centers_px, _FIRST_SIGMA_PX, np.ones_like(windows.values)
     radii = _radii_px(discs, face)
@@ -230,7 +164,7 @@ def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells:
         weights = np.concatenate([windows.present * chosen / variances, prior.weights], axis=1)
         data, start = np.concatenate([windows.values, prior.means], axis=1), prior.places_px
         if cells == 1 and turn > 0 and discs.radii_px.min() < _FLAT_RADIUS_PX:
-            start = _best_places(model, data, weights, prior)
+            start, _ = _places_on_grid(model, data, weights, prior, prior.places_px)
         minimum = minimise(
             model, data, weights, _with_light(model, data, weights, start, count), _STEPS, _SMALL_STEP_PX
         )
@@ -252,7 +186,13 @@ def _fit(windows: _Windows, discs: Ellipses, face: FaceBackground | None, cells:
     loss = misfit - float(np.log(np.linalg.det(minimum.covariance()[:, :2, :2])).sum())
     light = windows.samples(_pictures(windows, radii, minimum.parameters, (sigma_px, cells)).light)
     share = (light * (used > 0)).sum(axis=1) / light.sum(axis=1)
-    return _Fit(minimum, sigma_px, weights, size, share, loss)
+    found_px, found_cov = minimum.parameters[:, :2], minimum.covariance()[:, :2, :2]
+    if cells == 1 and discs.radii_px.min() < _FLAT_RADIUS_PX:
+        # At the edge of where the image does not change with the place, its slope there tells of one side only.
+        means, on_grid = _places_on_grid(model, data, weights, prior, found_px)
+        wide = (np.einsum("nii->ni", on_grid) > np.einsum("nii->ni", found_cov)).any(axis=1)[:, None]
+        found_px, found_cov = np.where(wide, means, found_px), found_cov + np.where(wide[:, None], on_grid, 0.0)
+    return _Fit(minimum, sigma_px, weights, size, share, loss, found_px, found_cov)
 
 
 def _radii_px(discs: Ellipses, face: FaceBackground | None) -> Array:
@@ -352,31 +292,39 @@ def _likely_places(discs: Ellipses, centers_px: Array, cov_px2: Array | None, fa
 def _with_light(model: Model, data: Array32, weights: Array32, places_px: Array, count: int) -> Minimum:
     """Discs at given places (N, 2) with the `count` amounts of light that fit best."""
     start = np.concatenate([places_px, np.zeros((len(places_px), count))], axis=1)
-    # Without light nothing depends on the place, so the first step is that of the light alone.
-    return minimise(model, data, weights, evaluate(model, data, weights, start), 1, np.inf)
+    # Without light nothing depends on the place but what is known of it before: with that at the places themselves the
+    # first step is one of the light alone.
+    here = data.copy()
+    here[:, -count - 2 : -count] = places_px
+    lit = minimise(model, here, weights, evaluate(model, here, weights, start), 1, np.inf)
+    return evaluate(model, data, weights, lit.parameters)
 
 
-def _best_places(model: Model, data: Array32, weights: Array32, prior: _Prior) -> Array:
-    """(N, 2) the means of the places on a grid about the prior's, by their likelihood.
+def _places_on_grid(
+    model: Model, data: Array32, weights: Array32, prior: _Prior, about_px: Array
+) -> tuple[Array, Array]:
+    """(N, 2) means and (N, 2, 2) covariances of the places on a grid about given ones, by their likelihood.
 
     The image of a disc that lies within one pixel does not show in which direction a better place lies.
     """
     offsets = np.stack(np.meshgrid(_GRID_PX, _GRID_PX), axis=-1).reshape(-1, 2)
-    fits = (_with_light(model, data, weights, prior.places_px + offset, prior.amounts.shape[1]) for offset in offsets)
+    fits = (_with_light(model, data, weights, about_px + offset, prior.amounts.shape[1]) for offset in offsets)
     misfits = np.stack([(fit.residuals**2 * weights).sum(axis=1) for fit in fits])
     likelihood = np.exp((misfits.min(axis=0) - misfits) / 2)
-    means: Array = prior.places_px + likelihood.T @ offsets / likelihood.sum(axis=0)[:, None]
-    return means
+    shares = (likelihood / likelihood.sum(axis=0)).T
+    means = shares @ offsets
+    away = offsets - means[:, None]
+    return about_px + means, np.einsum("nk,nki,nkj->nij", shares, away, away)
 
 
-def _pictures(windows: _Windows, radii_px: Array, parameters: Array, spread: tuple[float, int]) -> SpreadDiscs:
+def _pictures(windows: DiscWindows, radii_px: Array, parameters: Array, spread: tuple[float, int]) -> SpreadDiscs:
     sigma_px, cells = spread
     inside = np.clip(parameters[:, :2], -windows.half, windows.half)
     return spread_discs(inside, radii_px, np.full(len(radii_px), sigma_px), windows.half, cells)
 
 
 def _disc_model(
-    windows: _Windows, radii_px: Array, beside: tuple[Array32, Array32], spread: tuple[float, int]
+    windows: DiscWindows, radii_px: Array, beside: tuple[Array32, Array32], spread: tuple[float, int]
 ) -> Model:
     """The picture of discs, and last their parameters, of which some is known before the fit.
 
@@ -407,7 +355,7 @@ def _disc_model(
 
 
 def _background_basis(
-    windows: _Windows, discs: Ellipses, centers_px: Array, face: FaceBackground | None, spread: tuple[float, int]
+    windows: DiscWindows, discs: Ellipses, centers_px: Array, face: FaceBackground | None, spread: tuple[float, int]
 ) -> tuple[Array32, Array32]:
     """(N, B, K) pictures of the light beside the discs, and (N, K) 1 for the samples that they describe."""
     constant = np.ones_like(windows.values)[:, None]
@@ -427,7 +375,7 @@ def _background_basis(
     return np.concatenate([constant, shares], axis=1), chosen.astype(np.float32)
 
 
-def _variances(windows: _Windows, minimum: Minimum, weights: Array32) -> Array32:
+def _variances(windows: DiscWindows, minimum: Minimum, weights: Array32) -> Array32:
     """(N, K) variances that grow with the light, by a robust line through the squared residuals. [DN^2]"""
     size = windows.values.shape[1]
     residuals = minimum.residuals[:, :size]
@@ -450,7 +398,7 @@ def _variances(windows: _Windows, minimum: Minimum, weights: Array32) -> Array32
 
 
 def _common_sigma(
-    windows: _Windows, radii_px: Array, minimum: Minimum, weights: Array32, spread: tuple[float, int]
+    windows: DiscWindows, radii_px: Array, minimum: Minimum, weights: Array32, spread: tuple[float, int]
 ) -> float:
     """The spread after one step towards the one that fits all discs best. [px]"""
     pictures = _pictures(windows, radii_px, minimum.parameters, spread)
@@ -465,7 +413,7 @@ def _common_sigma(
 
 
 def _neighbours(
-    windows: _Windows,
+    windows: DiscWindows,
     eyes: NDArray[np.int64],
     radii_px: Array,
     found: tuple[Array, Array | None],

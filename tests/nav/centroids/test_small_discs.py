@@ -117,8 +117,8 @@ def test_a_disc_within_one_pixel_is_placed_in_that_pixel() -> None:
     assert rejected == 0
     # Uniform within 0.2 px of the pixel's middle is 0.115 px.
     assert np.sqrt((errors**2).mean()) < 0.15
-    # Discs that reach a little into the next pixel state less than they err: measured 2.5, 1.6 times the deviation.
-    assert np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors).mean() / 2 < 3.5
+    # Measured 1.3; without the spread over places 4 and more, for discs that reach a little into the next pixel.
+    assert np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors).mean() / 2 < 2.0
 
 
 def test_a_lamp_of_all_colours_in_a_mosaic_and_in_a_colour_image() -> None:
