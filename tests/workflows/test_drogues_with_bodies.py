@@ -89,7 +89,8 @@ def test_a_dataset_with_markerless_drogues_is_valid(dataset: Path) -> None:
     assert validate_dataset(dataset).faults == []
 
 
-@pytest.mark.parametrize("name", [name for name in FORMATS if name != "rosbag"])
+# `rosbag` needs sequences, and the formats of disparity and flow need depth, which drawn datasets lack.
+@pytest.mark.parametrize("name", [name for name in FORMATS if name not in ("rosbag", "middlebury", "sintel")])
 def test_every_format_takes_markerless_drogues(dataset: Path, tmp_path: Path, name: str) -> None:
     assert write_export(name, dataset, tmp_path / "out", ExportLog())
 
