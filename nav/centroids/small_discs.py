@@ -188,10 +188,8 @@ def _fit(windows: DiscWindows, discs: Ellipses, face: FaceBackground | None, cel
     share = (light * (used > 0)).sum(axis=1) / light.sum(axis=1)
     found_px, found_cov = minimum.parameters[:, :2], minimum.covariance()[:, :2, :2]
     if cells == 1 and discs.radii_px.min() < _FLAT_RADIUS_PX:
-        # At the edge of where the image does not change with the place, its slope there tells of one side only.
-        means, on_grid = _places_on_grid(model, data, weights, prior, found_px)
-        wide = (np.einsum("nii->ni", on_grid) > np.einsum("nii->ni", found_cov)).any(axis=1)[:, None]
-        found_px, found_cov = np.where(wide, means, found_px), found_cov + np.where(wide[:, None], on_grid, 0.0)
+        on_grid = _places_on_grid(model, data, weights, prior, found_px)
+        found_px, found_cov = _wider_places(found_px, found_cov, *on_grid)
     return _Fit(minimum, sigma_px, weights, size, share, loss, found_px, found_cov)
 
 
@@ -315,6 +313,16 @@ def _places_on_grid(
     means = shares @ offsets
     away = offsets - means[:, None]
     return about_px + means, np.einsum("nk,nki,nkj->nij", shares, away, away)
+
+
+def _wider_places(found_px: Array, found_cov: Array, means_px: Array, on_grid: Array) -> tuple[Array, Array]:
+    """Places and covariances of fits, or those on a grid about them where these are the wider ones.
+
+    At the edge of where the image does not change with the place, its slope there tells of one side only.
+    """
+    wide = (np.einsum("nii->ni", on_grid) > np.einsum("nii->ni", found_cov)).any(axis=1)
+    places: Array = np.where(wide[:, None], means_px, found_px)
+    return places, found_cov + np.where(wide[:, None, None], on_grid, 0.0)
 
 
 def _pictures(windows: DiscWindows, radii_px: Array, parameters: Array, spread: tuple[float, int]) -> SpreadDiscs:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
@@ -184,4 +185,4 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    typer.run(main)

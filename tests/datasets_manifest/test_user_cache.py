@@ -62,6 +62,18 @@ def test_damaged_files_are_made_anew(source: Path, damage: str) -> None:
     assert [kept(source, 2.0), kept(source, 3.0)] == [2.0, 2.0]
 
 
+def test_no_changed_byte_ends_the_process_or_gives_other_numbers(source: Path) -> None:
+    """Bytes that no checksum covers, such as times of members, may change nothing."""
+    user_cache._digest.cache_clear()
+    kept_arrays("land", [str(source)], lambda: {"a": np.arange(3.0)})
+    (path,) = files()
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x48]) + whole[place + 1 :])
+        arrays = kept_arrays("land", [str(source)], lambda: {"a": np.arange(3.0)})
+        assert arrays["a"].tolist() == [0.0, 1.0, 2.0], place
+
+
 def test_where_nothing_can_be_written_arrays_are_made_each_time(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
     assert [kept(source, 1.0), kept(source, 2.0)] == [1.0, 2.0]

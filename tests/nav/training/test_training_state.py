@@ -185,27 +185,21 @@ def test_filters_of_he_have_fewer_large_weights_the_more_inputs_they_have() -> N
         assert float(weights.detach().std()) == pytest.approx((2 / inputs) ** 0.5, rel=0.25)
 
 
-def test_a_checkpoint_from_before_filters_had_a_setting_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("gone", "former", "told"),
+    [("filter_sd", {}, "filter_sd"), ("warmup_fraction", {"warmup_passes": 1500}, "warmup_passes, warmup_fraction")],
+)
+def test_a_checkpoint_of_an_earlier_version_is_refused_in_one_line(
+    gone: str, former: dict[str, int], told: str, tmp_path: Path
+) -> None:
     settings = TrainingSettings(variant="s")
     state = new_state(new_network(settings), settings, ComputeDevice(torch.device("cpu"), bf16=False))
     save_state(tmp_path, state, settings, [])
     content = load_checkpoint(tmp_path / CHECKPOINT_FILE)
     assert content is not None
-    del content["settings"]["filter_sd"]
+    del content["settings"][gone]
+    content["settings"].update(former)
     save_checkpoint(tmp_path / CHECKPOINT_FILE, content)
-    with pytest.raises(ValueError, match=r"checkpoint\.pt: belongs to a training that differs in filter_sd;"):
-        restore_state(tmp_path, state, settings, [])
-
-
-def test_a_checkpoint_from_before_the_warm_up_was_a_share_is_refused_in_one_line(tmp_path: Path) -> None:
-    settings = TrainingSettings(variant="s")
-    state = new_state(new_network(settings), settings, ComputeDevice(torch.device("cpu"), bf16=False))
-    save_state(tmp_path, state, settings, [])
-    content = load_checkpoint(tmp_path / CHECKPOINT_FILE)
-    assert content is not None
-    del content["settings"]["warmup_fraction"]
-    content["settings"]["warmup_passes"] = 1500
-    save_checkpoint(tmp_path / CHECKPOINT_FILE, content)
-    with pytest.raises(ValueError, match=r"checkpoint\.pt: belongs to .* warmup_passes, warmup_fraction;") as caught:
+    with pytest.raises(ValueError, match=rf"checkpoint\.pt: belongs to .* differs in {told};") as caught:
         restore_state(tmp_path, state, settings, [])
     assert "\n" not in str(caught.value)
