@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
-from geometry.circles import disc_image_centers, disc_outline
+from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from nav.centroids.annuli import AnnulusFits, fit_annuli
@@ -41,6 +41,8 @@ _LEAST_MARKERS = 4
 _CLOSE_PX = 3.0
 # Standard deviation of a centre up to which it is a measurement without a fit. [px]
 _LARGEST_SIGMA_PX = 0.2
+# Mean square of the residuals of such centres over what they state; a sky beside a narrow face moves them by more.
+_LARGEST_SCATTER, _POSE_PARAMETERS = 6.0, 6
 # No part of the edge of smaller markers is clear of the rim's, so the other colours get the weight that removes that.
 _BALANCED_BELOW_PX = 8.0
 
@@ -64,8 +66,8 @@ def refine(
 
     Returns:
         Edge-fitted markers, without those that the fit rejects (clipped, cut, shadowed, occluded). Where too few fit,
-        the observation as given, or the reason where all are small. Hub edges are measured where the pose of the fitted
-        markers predicts them.
+        the observation as given, or the reason where small ones are not placed well enough without a fit. Hub edges are
+        measured where the pose of the fitted markers predicts them.
     """
     layout = observation.layout
     radius_px = observation.rig.camera.fx_px * layout.radius_m / rough.left_from_drogue.translation_m[2]
@@ -85,15 +87,20 @@ def refine(
         if radius_px > LARGEST_SMALL_RADIUS_PX:
             return observation
         small = _refine_small(images, observation, rough, radius_px)
-        return observation if isinstance(small, NoFixReason) and _are_placed(observation) else small
+        return observation if isinstance(small, NoFixReason) and _are_placed(observation, rough) else small
     refined = _with_markers(observation, fits)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
 
 
-def _are_placed(observation: Observation) -> bool:
-    """Whether markers are known well enough without a fit; peaks of light, which any light beside moves, are not."""
+def _are_placed(observation: Observation, rough: Solution) -> bool:
+    """Whether markers are known well enough without a fit.
+
+    Peaks of light, which any light beside moves, are not, nor are centres that miss their pose by more than they state.
+    """
     variances = np.einsum("enii->en", observation.cov_px2)[observation.seen] / 2
-    return bool(np.median(variances) < _LARGEST_SIGMA_PX**2)
+    freedom = max(2 * int(observation.seen.sum()) - _POSE_PARAMETERS, 1)
+    scatter = 2 * rough.modes[0].cost / freedom
+    return bool(np.median(variances) < _LARGEST_SIGMA_PX**2 and scatter < _LARGEST_SCATTER)
 
 
 def _are_mostly_clipped(signals: tuple[MarkerSignal, MarkerSignal], discs: Ellipses) -> bool:
@@ -136,7 +143,7 @@ def _with_predicted_markers(observation: Observation, rough: Solution) -> Observ
     for side, eye in enumerate(EYES):
         missing = ~observation.seen[side]
         if missing.any() and not missing.all():
-            centers = disc_image_centers(observation.rig, rough.left_from_drogue, layout.centers_m, radii_m, eye)
+            centers = project_disc_centers(observation.rig, rough.left_from_drogue, layout.centers_m, radii_m, eye)
             pixels[side, missing] = centers[missing]
     return replace(observation, pixels_px=pixels)
 
@@ -204,14 +211,14 @@ def _face_background(layout: MarkerLayout, index: NDArray[np.int64], scale_px_pe
 
 
 def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> Array:
-    """(2, N, 2, 2) shapes of the markers' images: equal circles, or for large markers the ellipses of their pose.
+    """(2, N, 2, 2) shapes of the markers' images: equal circles behind the lens, or for large ones their own ellipses.
 
     At 1.7 m the near side of a tilted drogue is larger by pixels. A circle's window would end within the blur of the
     edge there, and leave no face to fit its light to.
     """
     depth_m = pose.translation_m[2]
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
-    even = np.broadcast_to(radius_px * np.eye(2), (len(EYES), layout.count, 2, 2))
+    even = np.broadcast_to(_middle_shapes(rig, layout, pose, radius_px)[:, None], (len(EYES), layout.count, 2, 2))
     outlines_m = np.concatenate(
         [disc_outline(pose, at_m, layout.radius_m, _OUTLINE_POINTS) for at_m in layout.centers_m]
     )
@@ -223,6 +230,20 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
     scale = shape_radii(shapes) / radius_px
     likely = ((scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)).reshape(even.shape[:2])
     return np.where(likely[..., None, None], shapes.reshape(even.shape), even)
+
+
+def _middle_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform, radius_px: float) -> Array:
+    """(2, 2, 2) shapes in which the eyes show a marker that faces them in the drogue's middle."""
+    circle = np.broadcast_to(radius_px * np.eye(2), (len(EYES), 2, 2))
+    if rig.lenses is None:
+        return circle
+    facing = RigidTransform(np.eye(3), pose.translation_m)
+    outline_m = disc_outline(facing, np.zeros(3), layout.radius_m, _OUTLINE_POINTS)
+    points = np.stack([rig.image(outline_m, eye) for eye in EYES])
+    shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
+    scale = shape_radii(shapes) / radius_px
+    # Far outside of the images a lens's polynomial means nothing.
+    return np.where(((scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE))[:, None, None], shapes, circle)
 
 
 def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[Ellipses]:

@@ -20,7 +20,7 @@ from nav.centroids.centroid_uncertainty import NoiseModel, widen_for_nonlinearit
 from nav.centroids.disc_coverage import SpreadDiscs, spread_discs, spread_ring_shares
 from nav.centroids.disc_windows import DiscWindows, cut_windows
 from nav.centroids.discs import DiscFits
-from nav.centroids.ellipses import Ellipses
+from nav.centroids.ellipses import Ellipses, shape_inverses
 from nav.centroids.face_background import FaceBackground
 from nav.centroids.pixel_response import reduced_equations
 from nav.numerics.compiled import Array32
@@ -94,7 +94,7 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
 
     Args:
         images: the pair.
-        discs: outlines of known size, with centres right to about half a pixel.
+        discs: outlines of known size, as if they faced the camera, with centres right to about half a pixel.
         face: the face that they lie on; None where there is none, and the light beside a disc is a plane.
 
     Returns:
@@ -203,7 +203,8 @@ def _radii_px(discs: Ellipses, face: FaceBackground | None) -> Array:
     if maps is None:
         return round_
     along = np.hypot(maps[:, :2, 0], maps[:, :2, 1])
-    longest, shortest = np.linalg.svd(maps[..., :2], compute_uv=False).T
+    # A lens squeezes the picture of a face that is not tilted too, and the shapes hold that already.
+    longest, shortest = np.linalg.svd(shape_inverses(discs.shapes_px) @ maps[..., :2], compute_uv=False).T
     scale = np.sqrt(np.maximum(shortest / longest, _LEAST_ASPECT) / along.prod(axis=1))
     radii: Array = round_ * scale[:, None] * along
     return radii

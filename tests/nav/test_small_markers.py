@@ -7,11 +7,17 @@ import pytest
 
 from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
+from geometry.circles import disc_image_centers, disc_outline
+from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, StereoRig
-from nav.centroids.binary_centroids import small_centroids
+from nav.centroids.binary_centroids import quantisation_variance_px2, small_centroids
 from nav.centroids.disc_coverage import spread_discs, spread_ring_shares
+from nav.centroids.discs import DiscFits
+from nav.centroids.ellipses import Ellipses, outline_shapes
+from nav.centroids.face_background import FaceBackground
+from nav.centroids.small_discs import fit_small_discs
 from nav.matching.face_ring import find_face_ring, fit_face_ring, has_narrow_face
 from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import match_ring
@@ -109,6 +115,53 @@ def test_lamps_that_are_too_faint_are_told() -> None:
     told = measured(layout, images, pose)
     assert isinstance(told, NoFixReason)
     assert "peaks of light" in told.reason
+
+
+@pytest.mark.parametrize(("scatter", "is_kept"), [(1.0, True), (6.0, False)])
+def test_centres_that_no_fit_confirms_count_only_while_they_scatter_as_they_state(
+    scatter: float, is_kept: bool
+) -> None:
+    """Centres of mass of discs of 1.7 px before nothing that a fit could see."""
+    layout, rng = layout_of(ring(8)), np.random.default_rng(3)
+    pose = RigidTransform(rotation_from_angles(*np.radians([5, -6, 4])), np.array([0.1, -0.2, 10.0]))
+    images = pair_of(layout_of(np.zeros((0, 3))), pose, rng)
+    radius_px = np.full(8, CAMERA.fx_px * RADIUS_M / 10.0)
+    variance = quantisation_variance_px2(radius_px)[:, None, None] * np.eye(2)
+    centers = np.stack([disc_image_centers(RIG, pose, layout.centers_m, np.full(8, RADIUS_M), eye) for eye in EYES])
+    noise = np.sqrt(variance[0, 0, 0]) * rng.standard_normal(centers.shape)
+    matched = Observation(RIG, layout, centers + scatter * noise, np.stack([variance, variance]))
+    rough = joint(matched)
+    assert isinstance(rough, Solution)
+    found = refine(images, None, matched, rough)
+    assert (found is matched) == is_kept
+    assert isinstance(found, NoFixReason) != is_kept
+
+
+def test_small_discs_are_fitted_where_and_as_large_as_the_lens_shows_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the corner of a wide lens, with a marker that was not found and is fitted for its light beside the others."""
+    camera = PinholeCamera(640, 480, 400.0, 400.0, 319.5, 239.5)
+    lens = Lens(camera, BrownConrady(k1=-0.15, k2=0.02))
+    rig = StereoRig(camera, 0.25, RigidTransform(np.eye(3), np.zeros(3)), np.zeros(3), lenses=(lens, lens))
+    layout = MarkerLayout(ring(12), 0.015, None)
+    pose = RigidTransform(np.eye(3), np.array([-3.4, 2.5, 5.0]))
+    centers = np.stack([rig.project(pose.apply(layout.centers_m), eye) for eye in EYES])
+    centers[0, 4] = np.nan
+    matched = Observation(rig, layout, centers, np.broadcast_to(0.01 * np.eye(2), (2, 12, 2, 2)))
+    images = StereoImages(*2 * [np.full((480, 640), 64, np.uint16)], 0.0, 1e-3, bits=12)
+    begun = []
+
+    def fit(images: StereoImages, discs: Ellipses, face: FaceBackground | None) -> DiscFits:
+        begun.append(discs)
+        return fit_small_discs(images, discs, face)
+
+    monkeypatch.setattr("nav.refinement.fit_small_discs", fit)
+    refine(images, None, matched, Solution(pose, matched.seen))
+    discs, outlines = begun[0], [disc_outline(pose, each, layout.radius_m, 64) for each in layout.centers_m]
+    shown = np.stack([rig.image(outline, eye) for eye in EYES for outline in outlines])
+    np.testing.assert_allclose(discs.centers_px, shown.mean(axis=1), atol=0.02)
+    # The size is that of a disc in the middle of the ring; an ideal lens would show 1.2 px.
+    np.testing.assert_allclose(discs.shapes_px, outline_shapes(shown - shown.mean(axis=1, keepdims=True)), atol=0.04)
+    assert discs.radii_px.max() < 1.1
 
 
 FACE = MarkerLayout(ring(12), RADIUS_M, None, face_inner_radius_m=0.25, face_outer_radius_m=RIM_M)

@@ -13,6 +13,8 @@ from datasets_manifest.recipe.recipe import parse_recipe
 from droguekit.cli.main import DONE, run
 
 PAIRS = 4
+# The drogue is missed in a third of the pairs of these: more pairs, for as many poses as the others have.
+PAIRS_OF = {3: 8, 6: 8}
 SIZES = ((640, 480), (1280, 960), (1920, 1200), (4096, 3000))
 SENSORS = ("mono", "paper-colour", "rgb-ideal")
 COUNTS = (4, 6, 12, 24, 5, 8, 3, 16)
@@ -70,7 +72,7 @@ focal_px = {focal_px}
 baseline_m = {baseline_m}
 output_bits = {8 if self.number % 3 else 12}
 {eyes}[frames]
-count = {PAIRS}
+count = {PAIRS_OF.get(self.number, PAIRS)}
 scenes = 1
 [distance]
 law = "log-uniform"
@@ -120,6 +122,7 @@ def test_from_recipe_to_benchmark_without_a_fault(
     is_apart = gap_px - 2 * radius_px > 3
     is_measured = radius_px >= 1 and read.drogue.marker_count >= 4 and is_apart
     if is_measured and row["fix_fraction"] >= 0.5 and pooled is not None:
-        # Six to twelve errors know their root mean square to 20 to 30 %: of sets with a true ratio of 1.2 one in forty
-        # is above 1.75. A wrong match is off by far more. studies/acceptance/RESULTS.md has the ratios.
-        assert pooled < 2.0
+        # Off the optical axis the errors of a pair are one, along the line of sight: by chi-square of four, sets of
+        # four pairs with a true ratio of 1 lie within 0.35 and 1.67 in 95 of 100, those of six within 0.45 and 1.55.
+        # The seeds are fixed; studies/acceptance/RESULTS.md has the ratios.
+        assert pooled <= 1.5
