@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from droguekit.visualization.plan_page import PlanFigure, draw_figure, write_figure_page
+from droguekit.visualization.plan_page import PlanFigure, draw_figure, label_logarithmic, write_figure_page
 
 _COLORS = {"day": "#c98a00", "dusk": "#7b4fa3", "night": "#1f3d7a", "map": "#3a7d44"}
 _BRIGHTEST_PERCENT = 99.7
@@ -95,12 +95,12 @@ def _figures(rows: Sequence[Prediction], pictures: Sequence[DroguePicture]) -> I
     yield draw_figure(
         "Error of the position along the line of sight",
         "Cramer-Rao bound of all markers in both eyes.",
-        lambda axes: _curve(axes, rows, "z_sigma_m", "m"),
+        lambda axes: _curve(axes, rows, "z_sigma_m", "mm", factor=1e3),
     )
     yield draw_figure(
         "Error of the position across the line of sight",
         "Cramer-Rao bound of all markers in both eyes.",
-        lambda axes: _curve(axes, rows, "x_sigma_m", "m"),
+        lambda axes: _curve(axes, rows, "x_sigma_m", "mm", factor=1e3),
     )
     yield draw_figure(
         "Error of pitch",
@@ -118,15 +118,19 @@ def _picture(axes: Axes, picture: DroguePicture) -> None:
     axes.set_yticks([])
 
 
-def _curve(axes: Axes, rows: Sequence[Prediction], key: str, unit: str, limit: float | None = None) -> None:
+def _curve(
+    axes: Axes, rows: Sequence[Prediction], key: str, unit: str, limit: float | None = None, factor: float = 1.0
+) -> None:
     for light in dict.fromkeys(row.light for row in rows):
         own = [(row.distance_m, getattr(row, key)) for row in rows if row.light == light]
-        known = [(distance_m, value) for distance_m, value in own if value is not None and value > 0]
+        known = [(distance_m, factor * value) for distance_m, value in own if value is not None and value > 0]
         if known:
             axes.plot(*zip(*known, strict=True), "o-", markersize=4, color=_COLORS.get(light), label=light)
     if limit is not None:
         axes.axhline(limit, color="#b03a2e", linewidth=1)
     axes.set(xscale="log", yscale="log", xlabel="Distance [m]", ylabel=f"[{unit}]")
+    label_logarithmic(axes.xaxis, *axes.get_xlim())
+    label_logarithmic(axes.yaxis, *axes.get_ylim())
     axes.grid(True, alpha=0.3)
     if axes.has_data() and axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False)

@@ -11,9 +11,10 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import Recipe
@@ -26,6 +27,14 @@ _DPI = 130
 _BAR, _LAW = "#7aa9d8", "#b03a2e"
 _BINS = 24
 _CELL_PX = 40
+# Labels within a decade, by the largest ratio of an axis's limits; axes of a shorter range have even ones.
+_LABELS = (
+    (12.0, (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)),
+    (200.0, (1.0, 2.0, 5.0)),
+    (3000.0, (1.0, 3.0)),
+    (np.inf, (1.0,)),
+)
+_SHORT_RANGE = 3.0
 
 
 @dataclass(frozen=True)
@@ -163,12 +172,23 @@ def _log_edges(values: Array) -> Array:
 def _logarithmic(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_ylabel("Stereo pairs in a bin")
-    low, high = axes.get_xlim()
-    # An axis of about one decade gets more labels.
-    named = (1.0, 2.0, 4.0) if high > 12 * low else (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-    axes.xaxis.set_major_locator(LogLocator(base=10, subs=named, numticks=12))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    label_logarithmic(axes.xaxis, *axes.get_xlim())
+
+
+def label_logarithmic(axis: Axis, low: float, high: float) -> None:
+    """Labels that an axis of any range has several of.
+
+    Args:
+        axis: with a logarithmic scale.
+        low, high: its limits.
+    """
+    if high < _SHORT_RANGE * low:
+        axis.set_major_locator(MaxNLocator(6))
+    else:
+        subs = next(subs for ratio, subs in _LABELS if high < ratio * low)
+        axis.set_major_locator(LogLocator(base=10, subs=subs, numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:

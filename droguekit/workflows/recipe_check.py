@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,8 @@ _SPARE_PX, _CELLS = 4, 8
 _WITHIN_PIXEL_PX = 0.2
 _SMALLEST_RADIUS_PX, _LEAST_GAP_PX, _LEAST_BOX_PX = 0.3, 3.0, 16.0
 _MOST_CLIPPED = 0.95
+# Lamps are sought between these, by steps of a factor of 3, and then to 2 %.
+_LUMINANCES_CD_M2, _LADDER, _HALVINGS = (1e-4, 1e6), 22, 6
 
 
 @dataclass(frozen=True)
@@ -123,11 +125,15 @@ def check_recipe(recipe: Recipe) -> RecipeCheck:
         raise ValueError("check: the recipe shows a calibration board and no drogue")
     if marker_layout(recipe.drogue).count == 0:
         raise ValueError(f"check: the drogue {recipe.drogue.name} has no markers; detectors still give its box")
-    lights, markers = [], []
-    for light, scene in _scenes(recipe):
-        lights.append(scene.told(light))
-        markers += [_predict(recipe, scene, light, distance_m) for distance_m in _distances(recipe)]
-    return RecipeCheck(recipe.name, tuple(lights), tuple(markers), tuple(_advice(recipe, lights, markers)))
+    scenes = dict(_scenes(recipe))
+    lights = tuple(scene.told(light) for light, scene in scenes.items())
+    markers = tuple(
+        _predict(recipe, scene, light, distance_m)
+        for light, scene in scenes.items()
+        for distance_m in _distances(recipe)
+    )
+    check = RecipeCheck(recipe.name, lights, markers, ())
+    return replace(check, advice=tuple(_advice(recipe, check, scenes)))
 
 
 def check_lines(check: RecipeCheck) -> Iterator[str]:
@@ -169,14 +175,29 @@ def _distances(recipe: Recipe) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Light in one environment, as (3,) radiances [cd/m2], and the sensor's band [nm] or None."""
+    """Light in one environment, as (3,) radiances [cd/m2], and the sensor's band [nm] or None.
+
+    Markers show their lamps' light and that on their paint; `unit_lamp` is the light of lamps of 1 cd/m2.
+    """
 
     environment: Environment
     exposure: Exposure
     band_nm: float | None
     sky: Array
     face: Array
-    marker: Array
+    paint: Array
+    lamp: Array
+    unit_lamp: Array
+
+    @property
+    def marker(self) -> Array:
+        """(3,) light of a marker. [cd/m2]"""
+        light: Array = self.lamp + self.paint
+        return light
+
+    def with_lamps(self, luminance_cd_m2: float) -> _Scene:
+        """The same with other lamps, or with lamps where there are none."""
+        return replace(self, lamp=luminance_cd_m2 * self.unit_lamp)
 
     def told(self, light: str) -> LightPrediction:
         from scenes.sky.photometry import light_in_band
@@ -192,6 +213,7 @@ def _scenes(recipe: Recipe) -> Iterator[tuple[str, _Scene]]:
     from render.surfaces import lamp_radiance_rgb
     from scenes.environment_radiance import environment_radiance
     from scenes.sampler import automatic_exposure, recipe_of_scene, sample_frame, scene_of_frame
+    from scenes.sky.photometry import luminance
 
     index = next((k for k in range(recipe.frames.count) if recipe.frames.empty_fraction < 1), 0)
     own = recipe_of_scene(recipe, scene_of_frame(recipe, index))
@@ -208,8 +230,10 @@ def _scenes(recipe: Recipe) -> Iterator[tuple[str, _Scene]]:
         drogue = recipe.drogue
         behind = drogue.face_reflectance_rgb if drogue.body is None else drogue.canopy_reflectance_rgb
         lamp = np.zeros(3) if frame.drogue is None else lamp_radiance_rgb(frame, FIRST_MARKER_ID)
-        marker = lamp + np.array(drogue.marker_reflectance_rgb) * lux / np.pi
-        yield light, _Scene(environment, exposure, recipe.sensor.band_nm, sky, np.array(behind) * lux / np.pi, marker)
+        color = np.array(drogue.marker_emission_rgb)
+        unit = lamp / drogue.marker_luminance_cd_m2 if lamp.any() else color / max(float(luminance(color)), 1e-9)
+        face, paint = (np.array(each) * lux / np.pi for each in (behind, drogue.marker_reflectance_rgb))
+        yield light, _Scene(environment, exposure, recipe.sensor.band_nm, sky, face, paint, lamp, unit)
 
 
 def _predict(recipe: Recipe, scene: _Scene, light: str, distance_m: float) -> MarkerPrediction:
@@ -298,10 +322,9 @@ def _share_of_face(recipe: Recipe, scale_px_per_m: float, half: int, sigma_px: f
     return share
 
 
-def _advice(recipe: Recipe, lights: list[LightPrediction], markers: list[MarkerPrediction]) -> Iterator[str]:
+def _advice(recipe: Recipe, check: RecipeCheck, scenes: dict[str, _Scene]) -> Iterator[str]:
     """What will fail by the predictions, and what to change."""
-    drogue, first = recipe.drogue, lights[0].light
-    near = [row for row in markers if row.light == first]
+    drogue, near = recipe.drogue, check.of_light(check.lights[0].light)
     if drogue.marker_count < 4:
         yield f"{drogue.marker_count} markers leave no spare one: give the drogue at least 4, better 6"
     small = [row.distance_m for row in near if row.radius_px < _SMALLEST_RADIUS_PX]
@@ -320,8 +343,8 @@ def _advice(recipe: Recipe, lights: list[LightPrediction], markers: list[MarkerP
             f"the rim is below {_LEAST_BOX_PX:g} px from {tiny[0]:.3g} m on, where detectors begin to miss it: use a "
             "longer lens, or expect no box there"
         )
-    for light in lights:
-        yield from _advice_in(recipe, light, [row for row in markers if row.light == light.light])
+    for light in check.lights:
+        yield from _advice_in(recipe, light, check.of_light(light.light), scenes[light.light])
     if recipe.sensor.output_bits == 12:
         yield (
             "images have 12 bits in files of 16, which most viewers show as black: look at them with `preview` or "
@@ -329,7 +352,7 @@ def _advice(recipe: Recipe, lights: list[LightPrediction], markers: list[MarkerP
         )
 
 
-def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPrediction]) -> Iterator[str]:
+def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPrediction], scene: _Scene) -> Iterator[str]:
     lit = recipe.drogue.marker_luminance_cd_m2
     name = "lamps" if lit else "markers"
     when = {"day": "by day", "dusk": "at dusk", "night": "at night"}.get(light.light, "in this light")
@@ -342,10 +365,12 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
         yield f"{name} are darker than the sky {when}, {against}: use {use}"
     faint = [row for row in rows if row.snr < LEAST_SNR or row.contrast <= 0]
     if faint:
-        wanted = _rounded(max(light.marker_cd_m2, 1.0) * LEAST_SNR / max(min(row.snr for row in faint), 0.1))
+        faintest = min(faint, key=lambda row: (row.contrast > 0, row.snr))
+        enough = _least_luminance(recipe, scene, recipe.rig.camera.fx_px / faintest.distance_m)
+        use = "" if enough is None else f"{'' if lit else 'lamps of '}{_text(_rounded(enough))} cd/m2, "
         yield (
             f"{name} are below {LEAST_SNR:g} deviations of the noise {when} from {faint[0].distance_m:.3g} m on: use "
-            f"{_text(wanted)} cd/m2, a wider aperture or a longer exposure"
+            f"{use}a wider aperture or a longer exposure"
         )
     clipped = [row for row in rows if row.clipped_fraction > _MOST_CLIPPED]
     if clipped:
@@ -353,6 +378,25 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
             f"{name} are brighter than the sensor's range {when} up to {clipped[-1].distance_m:.3g} m: shorten "
             "exposure.auto_time_s, or meter the plate (exposure.auto_meter)"
         )
+
+
+def _least_luminance(recipe: Recipe, scene: _Scene, scale_px_per_m: float) -> float | None:
+    """Luminance from which on lamps stand out of the noise in a scene, or None where none does. [cd/m2]"""
+
+    def stands_out(luminance_cd_m2: float) -> bool:
+        contrast, snr, _, _ = _marker_light(recipe, scene.with_lamps(luminance_cd_m2), scale_px_per_m)
+        return contrast > 0 and snr >= LEAST_SNR
+
+    # Far brighter lamps are clipped and tell nothing again: the first step that suffices is sought from below.
+    ladder = np.geomspace(*_LUMINANCES_CD_M2, _LADDER)
+    first = next((k for k, step in enumerate(ladder) if stands_out(float(step))), None)
+    if first is None:
+        return None
+    low, high = float(ladder[max(first - 1, 0)]), float(ladder[first])
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if stands_out(middle) else (middle, high)
+    return high
 
 
 def _rounded(luminance_cd_m2: float) -> float:

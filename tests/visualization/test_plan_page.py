@@ -10,8 +10,10 @@ from typing import Unpack
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.visualization.plan_page import label_logarithmic
 from tests.support.recipe_builder import RecipeTable, between, recipe_text, stations
 from tests.support.small_datasets import SWINGING
 
@@ -87,3 +89,16 @@ def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytes
     (tmp_path / "file").write_text("")
     assert run(["plan", "smoke", "--no-probe", "--html", str(tmp_path / "file" / "plan.html")]) == WRONG_INPUT
     assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ratio", [1.03, 1.2, 2.0, 2.99, 3.1, 8.0, 12.0, 13.0, 100.0, 400.0, 4000.0, 1e7])
+@pytest.mark.parametrize("low", [0.0011, 0.7, 5.0, 16.8])
+def test_logarithmic_axes_of_any_range_have_several_labels(low: float, ratio: float) -> None:
+    axes = Figure().add_subplot()
+    axes.set(xscale="log", xlim=(low, low * ratio))
+    label_logarithmic(axes.xaxis, *axes.get_xlim())
+    ticks = axes.xaxis.get_major_locator()()
+    shown = [axes.xaxis.get_major_formatter()(tick) for tick in ticks if low <= tick <= low * ratio]
+    assert 3 <= len(shown) <= 10
+    # No two labels of an axis read alike.
+    assert len(set(shown)) == len(shown)

@@ -86,7 +86,10 @@ def test_more_noise_a_larger_error(tmp_path: Path) -> None:
             {"luminance": 2000.0, "paint": 0.02},
             r"lamps are darker than the sky by day, [\d,]+ against [\d,]+ cd/m2: use [\d,]+ cd/m2 or",
         ),
-        ({"luminance": 0.0}, r"markers are below 5 deviations of the noise at night from 6 m on: use [\d,]+ cd/m2"),
+        (
+            {"luminance": 0.0},
+            r"markers are below 5 deviations of the noise at night from 6 m on: use lamps of [\d.]+ cd",
+        ),
         ({"radius": 0.003}, r"markers are below 0.3 px radius from 1[0-9.]+ m on: use a radius of 0.008 m"),
         ({"count": 3}, r"3 markers leave no spare one"),
         ({"bits": 12}, r"12 bits in files of 16, which most viewers show as black"),
@@ -98,6 +101,19 @@ def test_more_noise_a_larger_error(tmp_path: Path) -> None:
 def test_what_will_fail_is_told_with_what_to_change(tmp_path: Path, changes: dict[str, float], message: str) -> None:
     advice = "\n".join(checked(written(tmp_path, **changes)).advice)
     assert re.search(message, advice), advice
+
+
+@pytest.mark.parametrize("luminance", [0.0, 0.002])
+def test_lamps_as_bright_as_advised_for_the_night_just_suffice(tmp_path: Path, luminance: float) -> None:
+    """Of dark markers nothing scales to what is needed; at night that is less than a thousandth of a lamp by day."""
+    advice = "\n".join(checked(written(tmp_path, luminance)).advice)
+    told = re.search(r"at night from 6 m on: use (?:lamps of )?([\d.,]+) cd/m2", advice)
+    assert told is not None, advice
+    wanted = float(told[1].replace(",", ""))
+    assert wanted < 20
+    least = min(row.snr for row in checked(written(tmp_path, wanted)).of_light("night"))
+    # Two figures, upwards.
+    assert 5 <= least < 5 * 1.15
 
 
 def test_the_command_writes_numbers_and_one_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
