@@ -102,6 +102,7 @@ def paper_view_recipe(
     samples: int = 16,
     speed_m_s: float = 0.0,
     rate_deg_s: float = 0.0,
+    window: float = 1.0,
 ) -> Recipe:
     """50 pairs by the paper's rig, with its pixels a side scaled at the same field of view.
 
@@ -110,8 +111,13 @@ def paper_view_recipe(
         stations_m: distances, in turn.
         samples: paths through each pixel of the drogue.
         speed_m_s, rate_deg_s: motion of the drogue.
+        window: share of the image's width and height that the rig has, around its middle.
     """
-    size = {"width_px": round(1280 * scale), "height_px": round(960 * scale), "focal_px": round(2133.3333 * scale, 6)}
+    size = {
+        "width_px": round(1280 * scale * window),
+        "height_px": round(960 * scale * window),
+        "focal_px": round(2133.3333 * scale, 6),
+    }
     return build_recipe(
         name="render-test",
         seed=5,

@@ -27,11 +27,11 @@ def scene_of(engine: RenderEngine) -> Callable[[FrameSpec], Any]:
     return lambda frame: scenes.scene_of(frame, environment_radiance(frame.environment))
 
 
-# The paper's field of view in half as many pixels a side.
+# The paper's field of view in a quarter as many pixels a side.
 BASE: RecipeTable = {
     "name": "passes",
     "seed": 3,
-    "rig": RIG_320_PX | {"width_px": 640, "height_px": 480, "focal_px": 1067.0, "probe_tip_body_m": [2.6, 0.5, 0.35]},
+    "rig": RIG_320_PX | {"probe_tip_body_m": [2.6, 0.5, 0.35]},
     "frames": {"count": 3},
     "distance": stations(2.0, 9.0, 33.0),
 }

@@ -61,7 +61,7 @@ def test_new_scenes_and_other_pixels_take_the_same_kernels(
 ) -> None:
     from render.mitsuba_engine.scene import KEPT_SCENES
 
-    recipe = paper_view_recipe(scale=0.25, stations_m=(4.0,), samples=4)
+    recipe = paper_view_recipe(scale=0.125, stations_m=(4.0,), samples=4)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 16})
     frame = sample_frame(recipe, 0)
     known: set[str] = set()

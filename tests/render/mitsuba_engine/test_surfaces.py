@@ -26,14 +26,22 @@ def aged(frame: FrameSpec, states: dict[int, SurfaceCondition], **more: Any) -> 
     return frame.model_copy(update={"condition": DrogueCondition(markers=markers, **more)})
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def recipe() -> Recipe:
-    return paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
+    drawn = paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
+    # What is looked at lies inside parts.
+    return drawn.model_copy(update={"render": drawn.render.model_copy(update={"edge_samples_per_px": 16})})
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def frame(recipe: Recipe) -> FrameSpec:
     return sample_frame(recipe, 0)
+
+
+@pytest.fixture(scope="module")
+def plain(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> EyeRadiance:
+    """The left eye's view of the frame as it is."""
+    return engine.render(frame, recipe.render).left
 
 
 def marker_light(seen: EyeRadiance, index: int) -> float:
@@ -41,18 +49,20 @@ def marker_light(seen: EyeRadiance, index: int) -> float:
     return float(seen.radiance_cd_m2[mask].mean())
 
 
-def test_faded_paint_reflects_less_in_its_share(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
-    plain = engine.render(frame, recipe.render).left
+def test_faded_paint_reflects_less_in_its_share(
+    engine: RenderEngine, recipe: Recipe, frame: FrameSpec, plain: EyeRadiance
+) -> None:
     faded = engine.render(aged(frame, {2: SurfaceCondition(reflectance_fraction=0.5)}), recipe.render).left
     # Light from the marker itself and from its neighbours' reflexes: the paths' noise is 1 % over some 200 pixels.
     assert marker_light(faded, 2) / marker_light(plain, 2) == pytest.approx(0.5, abs=0.05)
     assert marker_light(faded, 5) == pytest.approx(marker_light(plain, 5), rel=0.02)
 
 
-def test_a_frame_as_new_after_an_aged_one_is_as_new(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
-    plain = engine.render(frame, recipe.render).left.radiance_cd_m2
+def test_a_frame_as_new_after_an_aged_one_is_as_new(
+    engine: RenderEngine, recipe: Recipe, frame: FrameSpec, plain: EyeRadiance
+) -> None:
     engine.render(aged(frame, {0: SurfaceCondition(reflectance_fraction=0.2)}), recipe.render)
-    assert np.array_equal(engine.render(frame, recipe.render).left.radiance_cd_m2, plain)
+    assert np.array_equal(engine.render(frame, recipe.render).left.radiance_cd_m2, plain.radiance_cd_m2)
 
 
 def test_a_missing_marker_is_gone(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
@@ -82,12 +92,13 @@ def test_dirt_lies_where_its_map_has_it(engine: RenderEngine, recipe: Recipe, fr
     assert np.corrcoef(ratio, expected)[0, 1] > 0.85
 
 
-def test_lamps_shine_in_their_share(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
+def test_lamps_shine_in_their_share(
+    engine: RenderEngine, recipe: Recipe, frame: FrameSpec, plain: EyeRadiance
+) -> None:
     lit = frame.model_copy(update={"drogue": frame.drogue.model_copy(update={"marker_luminance_cd_m2": 1e6})})
     states = {0: SurfaceCondition(lamp_fraction=0.5), 1: SurfaceCondition(lamp_fraction=0.0)}
     seen = engine.render(aged(lit, states), recipe.render).left
-    off = engine.render(frame, recipe.render).left
-    own = [marker_light(seen, index) - marker_light(off, index) for index in range(3)]
+    own = [marker_light(seen, index) - marker_light(plain, index) for index in range(3)]
     # Other lamps' light that the markers reflect is below 1 % of their own.
     assert own[0] / own[2] == pytest.approx(0.5, abs=0.02)
     assert own[1] / own[2] == pytest.approx(0.0, abs=0.02)
@@ -142,7 +153,7 @@ def test_rays_go_through_real_lenses_as_the_analytic_engine_projects(engine: Ren
         rig={"preset": "paper-real", "width_px": 640, "height_px": 480, "focal_px": 1066.7},
         frames={"count": 1},
         distance=stations(3.0),
-        render={"samples_per_px": 2},
+        render={"samples_per_px": 1, "edge_samples_per_px": 1, "surround_samples_per_px": 1, "denoise": False},
     )
     frame = sample_frame(recipe, 0)
     traced, drawn = (renderer.render(frame, recipe.render) for renderer in (engine, load_engine("analytic")))
