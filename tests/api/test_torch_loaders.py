@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections import Counter
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,14 @@ from droguekit.batch.resume import open_dataset
 from droguekit.torch import PairDataset, RenderStream, sample_of_pair
 from tests.support.recipe_builder import build_recipe
 from tests.support.small_datasets import SINGLE_PAIRS
+
+
+@pytest.fixture(scope="module")
+def forks() -> BaseContext:
+    """How loaders start processes: from one that has imported already what they need."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["droguekit.torch", "droguekit.batch.frame_task"])
+    return context
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +130,13 @@ def test_processes_share_the_frames(shards: int, recipe: Recipe, tmp_path: Path)
         assert {frame % shards for frame in order} == {shard}
 
 
-def test_ranks_and_processes_of_loaders_render_each_frame_once(recipe: Recipe, tmp_path: Path) -> None:
+def test_ranks_and_processes_of_loaders_render_each_frame_once(
+    recipe: Recipe, forks: BaseContext, tmp_path: Path
+) -> None:
     frames: list[int] = []
     for rank in range(2):
         stream = RenderStream(recipe, tmp_path / "cache", rank=rank, ranks=2)
-        loader: DataLoader[Any] = DataLoader(stream, batch_size=2, num_workers=2, multiprocessing_context="spawn")
+        loader: DataLoader[Any] = DataLoader(stream, batch_size=2, num_workers=2, multiprocessing_context=forks)
         frames += [index for batch in loader for index in batch["frame_index"].tolist()]
     assert sorted(frames) == list(range(12))
 
@@ -138,8 +150,10 @@ def test_ranks_that_start_at_the_same_time_do_not_lock_each_other_out(recipe: Re
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_interrupted_training_goes_on_with_the_same_batches(workers: int, recipe: Recipe, tmp_path: Path) -> None:
-    context = "spawn" if workers else None
+def test_an_interrupted_training_goes_on_with_the_same_batches(
+    workers: int, recipe: Recipe, forks: BaseContext, tmp_path: Path
+) -> None:
+    context = forks if workers else None
 
     def batches(done: int) -> list[list[int]]:
         stream = RenderStream(recipe, tmp_path / "cache", replays=1)

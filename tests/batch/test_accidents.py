@@ -39,7 +39,7 @@ def test_frames_that_abort_always_are_reported_and_made_later(
     troubled(abort=[3])
     told = io.StringIO()
     out = tmp_path / "stormy"
-    stormy = render_recipe(out, workers=2, text=QUICK_RECIPE, told=told)
+    stormy = render_recipe(out, text=QUICK_RECIPE, told=told)
     reason = "its worker process died (SIGABRT), attempt 3 of 3"
     assert [(drop.frame_index, drop.reason) for drop in stormy.drops] == [(3, reason)]
     assert read_manifest(out).drops == stormy.drops
@@ -55,7 +55,7 @@ def test_frames_that_abort_always_are_reported_and_made_later(
     assert 0.01 < lines[-1]["workers_peak_gib"] < 4.0
     # Accidents of an earlier run do not count in the next one.
     troubled()
-    assert render_recipe(out, text=QUICK_RECIPE).dataset_sha256 == read_manifest(quick_dataset).dataset_sha256
+    assert render_recipe(out, workers=0, text=QUICK_RECIPE).dataset_sha256 == read_manifest(quick_dataset).dataset_sha256
     assert file_hashes(out) == file_hashes(quick_dataset)
 
 
@@ -94,7 +94,7 @@ def test_a_full_disk_ends_the_run_and_the_rest_goes_on_later(
         render_recipe(tmp_path / "out", text=QUICK_RECIPE)
     assert layout.frame_indices(tmp_path / "out") == [0, 1, 2, 3]
     troubled()
-    assert render_recipe(tmp_path / "out", text=QUICK_RECIPE).kept == 4
+    assert render_recipe(tmp_path / "out", workers=0, text=QUICK_RECIPE).kept == 4
     assert file_hashes(tmp_path / "out") == file_hashes(quick_dataset)
 
 
@@ -124,7 +124,7 @@ def test_a_disk_that_is_full_and_one_that_is_read_only(
     with pytest.raises(OSError, match="Read-only file system"):
         render_recipe(out, text=ANALYTIC_RECIPE)
     small_disk("rw,size=50m")
-    assert render_recipe(out, text=ANALYTIC_RECIPE).kept == len(there)
+    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).kept == len(there)
     assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
@@ -186,7 +186,7 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     assert layout.frame_indices(out) == [0, 1, 2]
     assert leftovers(out) == []
     troubled()
-    assert render_recipe(out, text=QUICK_RECIPE).kept == 3
+    assert render_recipe(out, workers=0, text=QUICK_RECIPE).kept == 3
 
 
 def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
@@ -203,7 +203,7 @@ def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
     out = tmp_path / "out"
     assert layout.frame_indices(out) == [0, 1]
     troubled()
-    assert render_recipe(out, text=QUICK_RECIPE).kept == 2
+    assert render_recipe(out, workers=0, text=QUICK_RECIPE).kept == 2
 
 
 def test_a_jump_of_the_clock_changes_nothing(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:

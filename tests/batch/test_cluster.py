@@ -96,8 +96,8 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
     start: Start, scheduler: str, tmp_path: Path
 ) -> None:
     text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
-    render_recipe(tmp_path / "calm", text=text)
-    workers = [worker(start, scheduler) for _ in range(3)]
+    render_recipe(tmp_path / "calm", workers=0, text=text)
+    workers = [worker(start, scheduler) for _ in range(2)]
 
     def change_the_crew() -> None:
         workers[0].kill()
@@ -253,7 +253,7 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
         worker_extra_args=["--no-dashboard"],
         scheduler_options={"dashboard": False, "dashboard_address": ":0"},
     ) as cluster:
-        cluster.scale(jobs=2)
+        cluster.scale(jobs=1)
         summary = render_recipe(
             tmp_path / "out", workers=ExecutionOptions(0, scheduler=cluster.scheduler_address), text=ANALYTIC_RECIPE
         )

@@ -31,7 +31,7 @@ def whole(analytic_dataset: Path) -> Path:
 def made_shards(tmp_path_factory: pytest.TempPathFactory, recipe_file: Path) -> tuple[Path, ...]:
     folder = tmp_path_factory.mktemp("shards")
     for number in range(3):
-        out = ["--out", str(folder / str(number)), "--shard", f"{number}/3", "--workers", "1"]
+        out = ["--out", str(folder / str(number)), "--shard", f"{number}/3", "--workers", "0"]
         assert run(["render", str(recipe_file), *out]) == DONE
     return tuple(folder / str(number) for number in range(3))
 
@@ -89,7 +89,7 @@ def test_a_damaged_frame_is_not_joined(
 def test_a_shard_of_another_recipe_is_refused(
     made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    render_recipe(tmp_path / "other", [2, 5], text=ANALYTIC_RECIPE.replace("seed = 5", "seed = 6"))
+    render_recipe(tmp_path / "other", [2, 5], workers=0, text=ANALYTIC_RECIPE.replace("seed = 5", "seed = 6"))
     assert merge(tmp_path / "out", *made_shards[:2], tmp_path / "other") == WRONG_INPUT
     assert "other: is of another recipe than" in (told := capsys.readouterr().err)
     assert "they differ in seed" in told

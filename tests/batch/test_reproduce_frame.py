@@ -39,11 +39,18 @@ def with_changed_record(tiny_dataset: Path, tmp_path: Path) -> Callable[[Change]
     return build
 
 
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are made again in this process, which starts the engine once."""
+    monkeypatch.setattr("droguekit.batch.frame_task.run_in_own_process", lambda function: function())
+
+
 def test_a_frame_made_again_is_identical(tiny_dataset: Path) -> None:
     result = reproduce_frame(tiny_dataset, 1)
     assert (result.verdict, result.differences, result.build_differences) == ("identical", (), ())
 
 
+@pytest.mark.usefixtures("here")
 def test_a_changed_image_is_a_difference(tiny_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "changed"
     shutil.copytree(tiny_dataset, out)
@@ -55,6 +62,7 @@ def test_a_changed_image_is_a_difference(tiny_dataset: Path, tmp_path: Path) -> 
     assert "left.png" in result.differences[0]
 
 
+@pytest.mark.usefixtures("here")
 def test_a_last_bit_counts_on_the_same_machine(with_changed_record: Callable[[Change], Path]) -> None:
     def change(table: dict[str, Any]) -> None:
         table["pitch_deg"] *= 1 + 1e-12
@@ -64,6 +72,7 @@ def test_a_last_bit_counts_on_the_same_machine(with_changed_record: Callable[[Ch
     assert [line.split(":")[0] for line in result.differences] == ["pitch_deg"]
 
 
+@pytest.mark.usefixtures("here")
 def test_elsewhere_numbers_may_differ_in_their_last_bits(with_changed_record: Callable[[Change], Path]) -> None:
     def change(table: dict[str, Any]) -> None:
         table["engine_version"] = "mitsuba 0.1"
@@ -75,6 +84,7 @@ def test_elsewhere_numbers_may_differ_in_their_last_bits(with_changed_record: Ca
     assert any("mitsuba 0.1 there" in line for line in result.build_differences)
 
 
+@pytest.mark.usefixtures("here")
 def test_elsewhere_labels_must_still_agree(with_changed_record: Callable[[Change], Path]) -> None:
     def change(table: dict[str, Any]) -> None:
         table["engine_version"] = "mitsuba 0.1"

@@ -40,10 +40,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         hose={},
         receiver={"nose_scene_fraction": 0.5},
         neighbours={"scene_fraction": 1.0, "distance_fraction": [1.2, 1.6]},
-        render={"samples_per_px": 4, "edge_samples_per_px": 16},
+        render={"samples_per_px": 1, "edge_samples_per_px": 4},
     )
     folder: Path = tmp_path_factory.mktemp("several") / "dataset"
-    render_recipe(folder, text=text)
+    render_recipe(folder, workers=0, text=text)
     return folder
 
 

@@ -23,7 +23,13 @@ def test_all_examples_are_known() -> None:
     assert {file.stem for file in EXAMPLES.glob("*.py")} == set(WRITTEN)
 
 
-@pytest.mark.parametrize("name", sorted(WRITTEN))
+# The longer ones use what tests of their subjects use.
+SLOW = {"score_an_estimator", "training_loop"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in sorted(WRITTEN)]
+)
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / f"{name}.py")], cwd=tmp_path, capture_output=True, text=True, check=False

@@ -11,7 +11,12 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 pytestmark = pytest.mark.mitsuba
 
 
-@pytest.mark.parametrize("name", sorted(file.stem for file in EXAMPLES.glob("*.ipynb")))
+# The longest one uses what tests of scoring use.
+SLOW = {"score_methods"}
+NAMES = sorted(file.stem for file in EXAMPLES.glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES])
 def test_a_notebook_runs(name: str, tmp_path: Path) -> None:
     nbformat = pytest.importorskip("nbformat", reason="nbclient is missing: pip install 'droguekit[notebook]'")
     from nbclient import NotebookClient

@@ -122,10 +122,10 @@ def file_hashes(dataset: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `TINY_RECIPE`, made by one worker in ascending order; to be read only."""
+    """The dataset of `TINY_RECIPE`, made in one process in ascending order; to be read only."""
 
     def render(out: Path) -> None:
-        assert render_recipe(out).drops == ()
+        assert render_recipe(out, workers=0).drops == ()
 
     return shared_folder(tmp_path_factory, "tiny", render)
 
@@ -164,12 +164,12 @@ def troubled(troubled_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="session")
 def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `QUICK_RECIPE`, made by one worker without an accident; to be read only."""
+    """The dataset of `QUICK_RECIPE`, made in one process without an accident; to be read only."""
 
     def render(out: Path) -> None:
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.syspath_prepend(troubled_site)
-            summary = render_recipe(out, text=QUICK_RECIPE)
+            summary = render_recipe(out, workers=0, text=QUICK_RECIPE)
         assert (summary.drops, summary.totals.retries) == ((), 0)
 
     return shared_folder(tmp_path_factory, "quick", render)
@@ -177,9 +177,9 @@ def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="session")
 def analytic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `ANALYTIC_RECIPE`, made by one worker; to be read only."""
+    """The dataset of `ANALYTIC_RECIPE`, made in one process; to be read only."""
 
     def render(out: Path) -> None:
-        assert render_recipe(out, text=ANALYTIC_RECIPE).drops == ()
+        assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).drops == ()
 
     return shared_folder(tmp_path_factory, "analytic", render)

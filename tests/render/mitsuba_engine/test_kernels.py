@@ -57,17 +57,17 @@ def without_marker(frame: FrameSpec, missing: int, moved_m: np.ndarray) -> Frame
 
 
 def test_new_scenes_and_other_pixels_take_the_same_kernels(
-    kernels: Callable[[FrameSpec, RenderSettings], set[str]],
+    kernels: Callable[[FrameSpec, RenderSettings], set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from render.mitsuba_engine.scene import KEPT_SCENES
-
+    kept_scenes = 4
+    monkeypatch.setattr("render.mitsuba_engine.scene.KEPT_SCENES", kept_scenes)
     recipe = paper_view_recipe(scale=0.125, stations_m=(4.0,), samples=4)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 16})
     frame = sample_frame(recipe, 0)
     known: set[str] = set()
     new = []
     # Twice as many scenes as are kept, so that old ones go meanwhile; each drogue covers other pixels.
-    for index in range(2 * KEPT_SCENES + 2):
+    for index in range(2 * kept_scenes + 2):
         moved_m = np.array([0.013, 0.008, 0.0]) * index
         missing = index % frame.drogue.marker_count
         taken = kernels(without_marker(frame, missing, moved_m), settings)
@@ -76,7 +76,7 @@ def test_new_scenes_and_other_pixels_take_the_same_kernels(
     assert new[0] > 6
     # Calls into scenes are compiled for all kinds of paint that any kept scene has, those of other tests too, until the
     # scenes here have taken their places.
-    settled = new[KEPT_SCENES + 1 :]
+    settled = new[kept_scenes + 1 :]
     # A ray that slips between the drogue's parts is sent again, by two kernels of its own. Were arrays used where NumPy
     # has put them, there would be variants for those that lie on 64 bytes and for those that do not, one or two a
     # scene; with numbers of shapes or pixels compiled in, five and more.
