@@ -92,9 +92,7 @@ def test_dirt_lies_where_its_map_has_it(engine: RenderEngine, recipe: Recipe, fr
     assert np.corrcoef(ratio, expected)[0, 1] > 0.85
 
 
-def test_lamps_shine_in_their_share(
-    engine: RenderEngine, recipe: Recipe, frame: FrameSpec, plain: EyeRadiance
-) -> None:
+def test_lamps_shine_in_their_share(engine: RenderEngine, recipe: Recipe, frame: FrameSpec, plain: EyeRadiance) -> None:
     lit = frame.model_copy(update={"drogue": frame.drogue.model_copy(update={"marker_luminance_cd_m2": 1e6})})
     states = {0: SurfaceCondition(lamp_fraction=0.5), 1: SurfaceCondition(lamp_fraction=0.0)}
     seen = engine.render(aged(lit, states), recipe.render).left
