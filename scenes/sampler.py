@@ -21,7 +21,7 @@ from scenes.camera_sampling import camera_of_scene
 from scenes.drogue_appearance import blinking_condition, condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
-from scenes.flight.sequence import sequence_kinematics
+from scenes.flight.sequence import sequence_kinematics, sequence_left_from_drogue
 from scenes.flight.suspension import hang_hose, hose_look_of_scene, hose_of_scene, sample_suspension
 from scenes.flight.trajectory import FrameKinematics, sample_attitude
 from scenes.framing import outline_points_m, sample_distance_m, sample_pose
@@ -190,9 +190,15 @@ def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform 
     """
     scene_id = scene_of_frame(recipe, frame_index)
     scene_recipe = recipe_of_scene(recipe, scene_id)
-    drogue = drogue_of_scene(scene_recipe, scene_id)
+    return left_from_drogue_in_scene(scene_recipe, drogue_of_scene(scene_recipe, scene_id), frame_index)
+
+
+def left_from_drogue_in_scene(
+    scene_recipe: Recipe, drogue: DrogueParameters, frame_index: int
+) -> RigidTransform | None:
+    """`sample_left_from_drogue` where the recipe of the frame's scene and its drogue are known already."""
     if scene_recipe.sequence is not None:
-        return sequence_kinematics(scene_recipe, scene_recipe.sequence, drogue, frame_index).left_from_drogue
+        return sequence_left_from_drogue(scene_recipe, scene_recipe.sequence, drogue, frame_index)
     return _pose_of_frame(scene_recipe, drogue, frame_index)
 
 

@@ -29,14 +29,20 @@ from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array
 from render.device import Device
-from scenes.sampler import scene_of_frame
+from render.engine import has_compiled
+from scenes.sampler import sample_frame, scene_of_frame
 
 PROBES = 5
-"""Measured frames with a drogue, unless another number is asked for."""
+"""Measured frames with a drogue at most, unless another number is asked for."""
+# Processor time of measured frames after which no more follow, unless their number was asked for. [s]
+_ENOUGH_S = 20.0
 # Fewer cannot separate distance from scene.
 _FEWEST_PROBES = 3
-# The first frames compile kernels; after the nearest and the farthest there are few left to compile.
+# The first frames compile kernels; after the farthest and the nearest there are few left to compile.
 _MOST_WARM_UP = 2
+# Processor time of a far frame above which no near one warms up where kernels are on disk already: it would take
+# several times as long, while the few kernels that are missing take about a second. [s]
+_LONG_WARM_UP_S = 2.0
 # Constant, inverse and inverse square of the distance.
 _TERMS = 3
 # The stage that makes a scene's environment; every process does it once for each of its scenes.
@@ -48,12 +54,16 @@ class ProbeFrames:
     """The frames that a probe makes.
 
     Attributes:
-        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk.
-        counted: the frames from which the cost is estimated.
+        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk. The second
+            one is left out where there are kernels on disk and it would take long.
+        counted: the frames from which the cost is estimated: the farthest, the nearest and one without a drogue, then
+            those between, from the middle outwards.
+        fewest: so many of them are made in any case, the others while they take little time.
     """
 
     warm_up: tuple[int, ...]
     counted: tuple[int, ...]
+    fewest: int
 
 
 @dataclass(frozen=True)
@@ -63,19 +73,19 @@ class ProbeResult:
     Attributes:
         warm_up: frames made before the others.
         counted: frames from which the cost is estimated.
-        repeated: the last frame, made a second time.
+        drawn_again_s: processor time of drawing the last frame a second time, when its environment exists. [s]
         start_cpu_s: processor time of the process outside the frames. [s]
         drops: frames that cannot be made, and why.
     """
 
     warm_up: dict[int, FrameReport]
     counted: dict[int, FrameReport]
-    repeated: FrameReport
+    drawn_again_s: float
     start_cpu_s: float
     drops: tuple[Drop, ...]
 
 
-def choose_probe_frames(drawn: DrawnFrames, count: int, most: int = PROBES) -> ProbeFrames:
+def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None) -> ProbeFrames:
     """One frame from each of several strata of distance, one without a drogue if there are any, and two to warm up.
 
     The nearest and the farthest frame are among the counted ones. Within a stratum, families and then scenes that were
@@ -84,19 +94,23 @@ def choose_probe_frames(drawn: DrawnFrames, count: int, most: int = PROBES) -> P
     Args:
         drawn: of the recipe.
         count: number of all pairs of the recipe.
-        most: counted frames with a drogue, at most.
+        most: counted frames with a drogue, at most; None for `PROBES`, and fewer where they take long.
     """
     shows = np.flatnonzero(np.isfinite(drawn.distances_m))
     order = shows[np.argsort(drawn.distances_m[shows], kind="stable")]
     strata: list[NDArray[np.intp]] = np.array_split(
-        order, min(most, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order)))
+        order, min(PROBES if most is None else most, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order)))
     )
     ends: list[NDArray[np.intp]] = [order[[-1]], *strata[1:-1], order[[0]]] if len(strata) > 1 else [order]
     empty = np.flatnonzero(np.isnan(drawn.distances_m))[:1]
     counted = _pick_rarest(drawn, [*ends, empty])
-    near_and_far = [strata[0], strata[-1]][:_MOST_WARM_UP]
-    warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in near_and_far]) or counted[:1]
-    return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)))
+    inner = counted[1 : len(ends) - 1]
+    middle_first = sorted(range(len(inner)), key=lambda k: abs(2 * k - len(inner) + 1))
+    counted = [*counted[:1], *counted[1 + len(inner) :], *(inner[k] for k in middle_first)]
+    fewest = len(counted) if most is not None else len(counted) - max(0, len(inner) - (_FEWEST_PROBES - 2))
+    far_and_near = [strata[-1], strata[0]][:_MOST_WARM_UP]
+    warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in far_and_near]) or counted[:1]
+    return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)), fewest)
 
 
 def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
@@ -127,16 +141,26 @@ def probe(recipe: Recipe, frames: ProbeFrames, device: Device = "cpu") -> ProbeR
 
 def _probe(recipe: Recipe, frames: ProbeFrames, device: Device) -> ProbeResult:
     drops = list[Drop]()
+    is_compiled = has_compiled(recipe.render.engine, device)
     with scratch_folder() as folder:
         task = FrameTask(recipe, folder, device=device)
-        warm_up, failed_s = make_in_turn(task, frames.warm_up, drops, False)
-        counted, more_failed_s = make_in_turn(task, frames.counted, drops, bool(warm_up))
+        warm_up, failed_s = make_in_turn(task, frames.warm_up[:1], drops, False)
+        if not is_compiled or all(cpu_s(report) < _LONG_WARM_UP_S for report in warm_up.values()):
+            more, more_failed_s = make_in_turn(task, frames.warm_up[1:], drops, bool(warm_up))
+            warm_up, failed_s = warm_up | more, failed_s + more_failed_s
+        counted, more_failed_s = make_in_turn(task, frames.counted[: frames.fewest], drops, bool(warm_up))
+        for frame_index in frames.counted[frames.fewest :]:
+            if len(counted) < frames.fewest or sum(map(cpu_s, counted.values())) < _ENOUGH_S:
+                more, again_failed_s = make_in_turn(task, (frame_index,), drops, bool(warm_up))
+                counted, more_failed_s = counted | more, more_failed_s + again_failed_s
         if not counted:
             raise ValueError(f"frames: none of {len(frames.counted)} can be made, the last because: {drops[-1].reason}")
-        repeated = task(next(reversed(counted)))
-    reports = [*warm_up.values(), *counted.values(), repeated]
-    in_frames_s = sum(cpu_s(report) for report in reports) + failed_s + more_failed_s
-    return ProbeResult(warm_up, counted, repeated, max(0.0, time.process_time() - in_frames_s), tuple(drops))
+    began_s = time.process_time()
+    sample_frame(recipe, next(reversed(counted)))
+    drawn_again_s = time.process_time() - began_s
+    in_frames_s = sum(cpu_s(report) for report in [*warm_up.values(), *counted.values()])
+    start_s = time.process_time() - in_frames_s - failed_s - more_failed_s - drawn_again_s
+    return ProbeResult(warm_up, counted, drawn_again_s, max(0.0, start_s), tuple(drops))
 
 
 def make_in_turn(
@@ -220,14 +244,14 @@ class CostEstimate:
         return max(1, min(workers, self.count), math.ceil(self.count / WorkerLimits().tasks_per_process))
 
 
-def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes: int = PROBES) -> CostEstimate:
+def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes: int | None = None) -> CostEstimate:
     """Render a few frames, spread over distances and families, and estimate the cost of all from them.
 
     Args:
         recipe: whose cost is estimated.
         plan: of the recipe.
         device: that the frames are rendered on.
-        probes: measured frames with a drogue, at most.
+        probes: measured frames with a drogue, at most; None for `PROBES`, and fewer where they take long.
 
     Raises:
         ValueError: the engine cannot be used, or none of the frames can be made.
@@ -240,12 +264,12 @@ def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes:
 def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> CostEstimate:
     """Extrapolate from measured frames to all pairs of a recipe."""
     reports = list(probed.counted.values())
-    every = [*probed.warm_up.values(), *reports, probed.repeated]
+    every = [*probed.warm_up.values(), *reports]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
     fit = _DistanceFit(plan.drawn, probed.counted)
     # Every pair takes in this stage what one takes whose environment exists already.
-    reused_s = _scene_stage_s(probed.repeated)
-    frames_s, error_s = fit.total([cpu_s(report) - _scene_stage_s(report) + reused_s for report in reports], count)
+    rest_s = [cpu_s(report) - _scene_stage_s(report) for report in reports]
+    frames_s, error_s = fit.total([seconds + probed.drawn_again_s for seconds in rest_s], count)
     return CostEstimate(
         probed=probed.counted,
         drops=probed.drops,
@@ -299,7 +323,7 @@ def _scene_s(recipe: Recipe, probed: ProbeResult) -> float:
         first_s.setdefault(unit, _scene_stage_s(report))
     # The very first frame also makes tables that all scenes share.
     later_s = list(first_s.values())[1:] or list(first_s.values())
-    return max(0.0, float(np.mean(later_s)) - _scene_stage_s(probed.repeated))
+    return max(0.0, float(np.mean(later_s)) - probed.drawn_again_s)
 
 
 def _scene_stage_s(report: FrameReport) -> float:

@@ -24,7 +24,7 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from labelgen.part_pixels import drogue_box
 from scenes.drogue_appearance import drogue_of_scene
-from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_drogue, scene_of_frame, split_of_scenes
+from scenes.sampler import family_of_scene, left_from_drogue_in_scene, recipe_of_scene, scene_of_frame, split_of_scenes
 
 # A worker may load its engine and compile kernels within its first frame.
 _START_S = 300.0
@@ -169,7 +169,7 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
         ValueError: none of the first ones can be made.
     """
     places = {family.name: place for place, family in enumerate(recipe.families)}
-    known: dict[int, tuple[int, DrogueParameters, bool]] = {}
+    known: dict[int, tuple[Recipe, int, DrogueParameters, bool]] = {}
     drawn, scenes, rows, drops = list[int](), list[int](), list[Array](), list[Drop]()
     for frame_index in indices:
         scene_id = scene_of_frame(recipe, frame_index)
@@ -177,8 +177,9 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
             if scene_id not in known:
                 own = recipe_of_scene(recipe, scene_id)
                 is_placed = not own.pose.on_axis and recipe.sequence is None
-                known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
-            row = _row(recipe, frame_index, *known[scene_id][1:])
+                known[scene_id] = own, places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
+            own, _, drogue, is_placed = known[scene_id]
+            row = _row(own, frame_index, drogue, is_placed)
         except ValueError as error:
             drops.append(make_drop(frame_index, error))
             if not drawn and len(drops) >= min(FIRST_FRAMES, len(indices)):
@@ -191,7 +192,7 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
     return DrawnFrames(
         indices=tuple(drawn),
         scenes=np.array(scenes, dtype=np.int64),
-        families=np.array([known[scene_id][0] for scene_id in scenes], dtype=np.int64),
+        families=np.array([known[scene_id][1] for scene_id in scenes], dtype=np.int64),
         distances_m=values[:, 0],
         centers_px=values[:, 1:3],
         sides_px=values[:, 3],
@@ -200,16 +201,16 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
     )
 
 
-def _row(recipe: Recipe, frame_index: int, drogue: DrogueParameters, is_placed: bool) -> Array:
+def _row(scene_recipe: Recipe, frame_index: int, drogue: DrogueParameters, is_placed: bool) -> Array:
     """(_COLUMNS,) distance [m], middle and side of the box, and room of its middle [px].
 
     Raises:
         ValueError: a pose that cannot be framed.
     """
-    pose = sample_left_from_drogue(recipe, frame_index)
+    pose = left_from_drogue_in_scene(scene_recipe, drogue, frame_index)
     if pose is None:
         return np.full(_COLUMNS, np.nan)
-    center_px, side_px, room_px = _box(drogue, recipe.rig, pose)
+    center_px, side_px, room_px = _box(drogue, scene_recipe.rig, pose)
     return np.array([pose.translation_m[2], *center_px, side_px, *(room_px if is_placed else np.full(4, np.nan))])
 
 

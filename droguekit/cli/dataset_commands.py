@@ -115,7 +115,9 @@ def plan(
     seed: SeedOption = None,
     probe: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Frames with a drogue to render for the estimate of time and size (5)."),
+        typer.Option(
+            min=1, metavar="N", help="Frames with a drogue to render for the estimate of time and size (3 to 5)."
+        ),
     ] = None,
     no_probe: Annotated[bool, typer.Option("--no-probe", help="Render nothing: no time and size.")] = False,
     workers: WorkersOption = None,

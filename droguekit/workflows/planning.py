@@ -47,7 +47,7 @@ def plan_lines(
         ValueError: no such recipe or engine, a wrong number, or none of the first frames can be made.
         OSError: the page or the temporary folder cannot be written.
     """
-    from droguekit.batch.frame_cost import PROBES, probe_cost
+    from droguekit.batch.frame_cost import probe_cost
     from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
     if execution.workers is not None and (probes == 0 or execution.workers < 1):
@@ -57,8 +57,7 @@ def plan_lines(
     lines = [*_counts(recipe, plan), *_distances(recipe, plan), *_laws(recipe, plan)]
     lines.append(f"a frame that is at work for {duration(frame_timeout_s(recipe))} counts as hung and is tried again")
     yield from lines
-    probes = PROBES if probes is None else probes
-    if probes:
+    if probes != 0:
         costs = list(cost_lines(probe_cost(recipe, plan, execution.device, probes), execution.worker_count()))
         yield from costs
         lines += costs

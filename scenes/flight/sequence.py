@@ -19,6 +19,7 @@ from geometry.se3 import FRD_FROM_OPTICAL, Array, RigidTransform, exp_twist, log
 from scenes.environment_sampling import sample_uniform
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.dropouts import (
+    DropoutEvent,
     OccludingBar,
     formation_displacement_m,
     occluding_bar,
@@ -68,9 +69,25 @@ def sequence_kinematics(
         ValueError: the drogue comes too near to the camera or turns away from it, or the airspeed is too low for
             turbulence.
     """
+    flight, place = _flight_of_frame(recipe, sequence, drogue, frame_index)
+    return flight.kinematics(place, recipe.rig.camera)
+
+
+def sequence_left_from_drogue(
+    recipe: Recipe, sequence: SequenceRanges, drogue: DrogueParameters, frame_index: int
+) -> RigidTransform:
+    """The pose of `sequence_kinematics` alone, in a sixth of the time; arguments and errors are the same."""
+    flight, place = _flight_of_frame(recipe, sequence, drogue, frame_index)
+    return flight.left_from_drogue(place)
+
+
+def _flight_of_frame(
+    recipe: Recipe, sequence: SequenceRanges, drogue: DrogueParameters, frame_index: int
+) -> tuple[Flight, int]:
+    """The sequence of a frame, and the frame's place in it."""
     sequence_id, place = divmod(frame_index, sequence.frames_per_sequence)
     flight = _flight(recipe.stream_seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
-    return flight.kinematics(place, recipe.rig.camera)
+    return flight, place
 
 
 # Frames of a recipe are mostly rendered in order, so that the last two simulated sequences are enough.
@@ -184,6 +201,14 @@ class Flight:
             sun_deg=self._sun_deg,
         )
 
+    def left_from_drogue(self, place: int) -> RigidTransform:
+        """The pose of `kinematics` alone; raises as it does."""
+        time_s = place / self._sequence.frame_rate_hz
+        steady = self._check_visible(time_s)
+        # A bar or a sun that fits no frame of the sequence raises.
+        _ = self._bar, self._sun_deg
+        return steady if self._turning is None else self._left_from_drogue(time_s)
+
     def _world_from_tanker(self, time_s: float) -> Array:
         """(3, 3) attitude of the formation: it flies east, unless it turns into the sun."""
         if self._dropout is None or self._dropout.kind != "glare":
@@ -206,6 +231,11 @@ class Flight:
         pose: RigidTransform = self.tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
         return pose
 
+    @property
+    def _turning(self) -> DropoutEvent | None:
+        """How the receiver turns aside in this sequence, or None."""
+        return self._dropout if self._dropout is not None and self._dropout.kind == "out-of-view" else None
+
     @cached_property
     def _bar(self) -> OccludingBar | None:
         """The bar that occludes the drogue in this sequence, or None."""
@@ -227,9 +257,9 @@ class Flight:
     def tanker_from_left(self, time_s: float) -> RigidTransform:
         """Pose of the left eye in axes that move with the tanker."""
         steady = self._steady_tanker_from_left(time_s)
-        if self._dropout is None or self._dropout.kind != "out-of-view":
+        if self._turning is None:
             return steady
-        return RigidTransform(steady.rotation @ self._dropout.receiver_rotation(time_s), steady.translation_m)
+        return RigidTransform(steady.rotation @ self._turning.receiver_rotation(time_s), steady.translation_m)
 
     def _steady_tanker_from_left(self, time_s: float) -> RigidTransform:
         """The same for a receiver that does not turn aside."""
@@ -243,8 +273,14 @@ class Flight:
         rotation = drogue_rotation(self._trajectory.mouth(time_s), self._roll_rad)
         return RigidTransform(rotation, self._trajectory.nodes_m(time_s)[-1] - rotation @ self._drogue_from_tail_m)
 
-    def _check_visible(self, time_s: float) -> None:
-        # For a receiver that does not turn aside: which side of the drogue it sees does not depend on where it looks.
+    def _check_visible(self, time_s: float) -> RigidTransform:
+        """`left_from_drogue` for a receiver that does not turn aside.
+
+        Which side of the drogue it sees does not depend on where it looks.
+
+        Raises:
+            ValueError: the drogue comes too near to the camera or turns away from it.
+        """
         left_from_drogue = self._steady_tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
         depth_m = float(left_from_drogue.translation_m[2])
         what = f"sequence {self._id}: leaves the visible volume at {time_s:.2f} s"
@@ -259,6 +295,8 @@ class Flight:
                 f"{what}: the drogue's axis is {axis_angle_deg:.0f} degrees from the camera's, more than "
                 f"{_MOST_AXIS_ANGLE_DEG:g}; raise hose.airspeed_m_s, or tilt the camera by pose.camera_pitch_deg"
             )
+        visible: RigidTransform = left_from_drogue
+        return visible
 
 
 def _twist(pose_at: Callable[[float], RigidTransform], time_s: float) -> Array:

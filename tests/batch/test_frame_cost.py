@@ -12,6 +12,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
+from droguekit.batch import frame_cost
 from droguekit.batch.frame_cost import (
     CostEstimate,
     ProbeResult,
@@ -26,7 +27,7 @@ from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
 from droguekit.workflows.planning import cost_lines
 from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE
-from tests.support.recipe_builder import RecipeTable, between, build_recipe
+from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, build_recipe
 
 BASE: RecipeTable = {
     "name": "spread",
@@ -89,6 +90,29 @@ def test_a_near_and_a_far_frame_come_first() -> None:
     assert len(distances) == 2
 
 
+def test_the_ends_and_the_middle_are_probed_in_any_case_and_all_that_are_asked_for() -> None:
+    drawn = plan_recipe(build_recipe(BASE)).drawn
+    order = choose_probe_frames(drawn, 200)
+    distances = drawn.distances_m[[drawn.indices.index(index) for index in order.counted]]
+    assert (distances[0], distances[1]) == (np.nanmax(distances), np.nanmin(distances))
+    # One without a drogue, and the middle one of five.
+    assert np.isnan(distances[2]) and distances[3] == np.nanmedian(distances)
+    assert order.fewest == 4
+    asked = choose_probe_frames(drawn, 200, most=5)
+    assert (asked.counted, asked.fewest) == (order.counted, 6)
+
+
+@pytest.mark.parametrize(("longest_s", "made"), [(0.0, (1, 4)), (1e9, (2, 6))])
+def test_frames_that_take_long_are_few(
+    longest_s: float, made: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frame_cost, "_ENOUGH_S", longest_s)
+    monkeypatch.setattr(frame_cost, "_LONG_WARM_UP_S", longest_s)
+    recipe = build_recipe(BASE, rig=RIG_160_PX, frames={"scenes": 2}, render={"engine": "analytic"})
+    found = frame_cost._probe(recipe, choose_probe_frames(plan_recipe(recipe).drawn, 200), "cpu")
+    assert (len(found.warm_up), len(found.counted)) == made
+
+
 def test_few_frames_are_probed_where_there_are_few() -> None:
     drawn = plan_recipe(build_recipe(BASE, frames={"count": 2, "empty_fraction": 0.0})).drawn
     order = choose_probe_frames(drawn, 2)
@@ -116,7 +140,7 @@ def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], 
     order = choose_probe_frames(drawn, recipe.frames.count)
     warm_up = {index: report(index) for index in order.warm_up}
     counted = {index: report(index) for index in order.counted}
-    return ProbeResult(warm_up, counted, report(order.counted[-1]), 3.0, ())
+    return ProbeResult(warm_up, counted, report(order.counted[-1]).stage_s["sample"], 3.0, ())
 
 
 def test_drawing_a_frame_counts_for_every_pair_and_a_new_scene_once() -> None:

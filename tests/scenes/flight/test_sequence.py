@@ -126,6 +126,16 @@ def test_a_guided_receiver_keeps_the_drogue_in_view() -> None:
     assert np.mean([share_in_view(flight, range(450, 900, 18)) for flight in flights]) >= 0.97
 
 
+@pytest.mark.parametrize("kind", [None, "out-of-view", "occlusion", "glare"])
+def test_a_pose_drawn_alone_is_that_of_the_frame(kind: str | None) -> None:
+    lost = {} if kind is None else {"losses": {"kinds": [kind], "begins_s": 0.2, "lasts_s": 0.2, "onset_s": 0.1}}
+    # Glare needs a look upwards.
+    drawn = build_recipe(STATION_KEEPING, sequence={**RELEASED, **lost}, pose={"camera_pitch_deg": 10})
+    for index in range(0, 12, 3):
+        alone, whole = sample_left_from_drogue(drawn, index), sample_frame(drawn, index).left_from_drogue
+        np.testing.assert_array_equal(alone.as_matrix(), whole.as_matrix())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("turbulence", ["light", "moderate"])
 def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence: str) -> None:
