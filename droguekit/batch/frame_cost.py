@@ -110,7 +110,8 @@ def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None)
     fewest = len(counted) if most is not None else len(counted) - max(0, len(inner) - (_FEWEST_PROBES - 2))
     far_and_near = [strata[-1], strata[0]][:_MOST_WARM_UP]
     warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in far_and_near]) or counted[:1]
-    return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)), fewest)
+    first, then = (tuple(drawn.indices[place] for place in places) for places in (warm_up, counted))
+    return ProbeFrames(warm_up=first, counted=then, fewest=fewest)
 
 
 def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
