@@ -102,14 +102,24 @@ def sample_distance_m(rng: np.random.Generator, law: DistanceLaw, frame_index: i
     """
     if law.stations_m is not None:
         return law.stations_m[frame_index % len(law.stations_m)]
+    return distance_at(law, rng.random())
+
+
+def distance_at(law: DistanceLaw, share: float) -> float:
+    """Distance at a share from 0 to 1, which, drawn evenly, gives the law between its two ends. [m]"""
     assert law.low_m is not None and law.high_m is not None
-    u = rng.random()
+    low_m, high_m = law.low_m, law.high_m
+    if law.edges_m is not None and law.weights is not None:
+        ends = np.concatenate([[0.0], np.cumsum(law.weights) / sum(law.weights)])
+        place = min(int(np.searchsorted(ends, share, side="right")), len(law.weights)) - 1
+        low_m, high_m = law.edges_m[place], law.edges_m[place + 1]
+        share = float((share - ends[place]) / max(ends[place + 1] - ends[place], 1e-300))
     if law.law == "uniform":
-        return float(law.low_m + u * (law.high_m - law.low_m))
+        return float(low_m + share * (high_m - low_m))
     if law.law == "log-uniform":
-        return float(law.low_m * (law.high_m / law.low_m) ** u)
+        return float(low_m * (high_m / low_m) ** share)
     # Uniform in inverse distance, to which the size in the image is proportional.
-    return float(1.0 / (1.0 / law.high_m + u * (1.0 / law.low_m - 1.0 / law.high_m)))
+    return float(1.0 / (1.0 / high_m + share * (1.0 / low_m - 1.0 / high_m)))
 
 
 def sample_point_in_view(rng: np.random.Generator, rig: StereoRig, depth_m: float) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -18,12 +19,21 @@ class DistanceLaw(FrozenModel):
     Attributes:
         law: `uniform`, `log-uniform` or `uniform-image-size` (uniform in 1/distance) between `low_m` and `high_m`; or
             `stations`, which takes the values of `stations_m` in turn, frame by frame.
+        edges_m, weights: ascending distances from `low_m` to `high_m`, and the share of the frames between neighbours,
+            relative to the other weights; the law holds within each bin. None for the law from end to end. [m]
     """
 
     law: Literal["uniform", "log-uniform", "uniform-image-size", "stations"]
     low_m: float | None = Field(default=None, gt=0, le=1000)
     high_m: float | None = Field(default=None, gt=0, le=1000)
     stations_m: tuple[Annotated[float, Field(gt=0, le=1000)], ...] | None = Field(default=None, min_length=1)
+    # Left out at their default, so that the hashes of other recipes stay those of earlier versions.
+    edges_m: tuple[Annotated[float, Field(gt=0, le=1000)], ...] | None = Field(
+        default=None, min_length=2, max_length=1000, exclude_if=lambda edges: edges is None
+    )
+    weights: tuple[Annotated[float, Field(ge=0, le=1e6)], ...] | None = Field(
+        default=None, max_length=999, exclude_if=lambda weights: weights is None
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -34,6 +44,22 @@ class DistanceLaw(FrozenModel):
             raise ValueError(f"low_m, high_m: the law '{self.law}' takes both, and no stations_m")
         elif self.low_m > self.high_m:
             raise ValueError(f"low_m: {self.low_m:g} is above high_m, {self.high_m:g}")
+        return self
+
+    @model_validator(mode="after")
+    def _bins(self) -> Self:
+        if (self.edges_m is None) != (self.weights is None):
+            raise ValueError("edges_m, weights: need each other")
+        if self.edges_m is None or self.weights is None:
+            return self
+        if (self.edges_m[0], self.edges_m[-1]) != (self.low_m, self.high_m):
+            raise ValueError("edges_m: must begin with low_m and end with high_m")
+        if any(low >= high for low, high in pairwise(self.edges_m)):
+            raise ValueError("edges_m: must ascend")
+        if len(self.weights) != len(self.edges_m) - 1:
+            raise ValueError(f"weights: need one for each of {len(self.edges_m) - 1} bins, got {len(self.weights)}")
+        if sum(self.weights) <= 0:
+            raise ValueError("weights: must not all be zero")
         return self
 
     @property

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import io
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
-from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
 from droguekit.assurance.design_domain import Crossing, DesignDomain, Placed
-from droguekit.batch.progress import PlainProgress, ProgressReport
+from droguekit.assurance.solved_cases import SolvedCases, solved_cases
+from droguekit.batch.progress import ProgressReport
 from droguekit.scoring.confidence_intervals import Interval, fraction_interval
-from droguekit.scoring.detection.detection_metrics import Evaluation, best_f1
-from droguekit.scoring.detection.detection_truth import ImageTruth, image_truth
-from droguekit.scoring.poses.pose_errors import estimates_by_method
-from droguekit.scoring.results.detection_result import image_id_of, read_detections
-from geometry.stereo import EYES
 
 _MOST_LINES = 20
 
@@ -123,9 +115,7 @@ def measure_coverage(
 ) -> Coverage:
     """Count the pairs in each cell of a domain, and the solved ones where there are estimates or detections.
 
-    A pose is solved where its position is wrong by at most the domain's fraction of the distance; a pair without an
-    estimate is not. A box is solved where the detector's box overlaps it by half, from the score on that gives the best
-    F1 on the whole dataset.
+    See `solved_cases` for what is solved.
 
     Args:
         dataset: with its truth.
@@ -138,35 +128,12 @@ def measure_coverage(
         ValueError: no such dataset, or a record or file that cannot be read.
     """
     source = Dataset(dataset)
-    read = None if estimates is None else read_estimates(estimates)
-    methods = {} if read is None else estimates_by_method(read, source.frame_indices, str(estimates))
-    camera, splits = source.manifest.recipe.rig.camera, source.manifest.split_of_frame()
     placed: dict[int, dict[str, Placed]] = {}
-    solved: dict[int, dict[str, tuple[int, int]]] = defaultdict(dict)
-    images: list[ImageTruth] = []
-    shown = PlainProgress(io.StringIO()) if report is None else report
-    shown.begin("pairs", len(source.frame_indices))
-    try:
-        for index in source.frame_indices:
-            record = source.record(index)
-            placed[index] = domain.bins_of(record)
-            for name, answers in methods.items():
-                if record.left_from_drogue is not None:
-                    answer = answers.get(index)
-                    solved[index][name] = int(_is_near(answer, record, domain.most_position_error_fraction)), 1
-            if detections:
-                size_px = (camera.width_px, camera.height_px)
-                images += [image_truth(record, eye, splits[index], size_px) for eye in EYES]
-            shown.advance()
-    finally:
-        shown.end()
-    image_ids = frozenset(image_id_of(index, eye) for index in source.frame_indices for eye in EYES)
-    for path in detections:
-        if path.stem in methods:
-            raise ValueError(f"--detections: {path.stem!r} is also a method's name; rename the file")
-        for index, share in _found_boxes(images, path, image_ids).items():
-            solved[index][path.stem] = share
-    names = (*methods, *(path.stem for path in detections))
+
+    def place(record: PairRecord) -> None:
+        placed[record.frame_index] = domain.bins_of(record)
+
+    names, solved = solved_cases(source, domain.most_position_error_fraction, place, estimates, detections, report)
     return Coverage(
         dataset=source.manifest.name,
         dataset_sha256=source.manifest.dataset_sha256,
@@ -181,32 +148,11 @@ def measure_coverage(
     )
 
 
-def _is_near(answer: Estimate | None, record: PairRecord, most_fraction: float) -> bool:
-    if not isinstance(answer, PoseEstimate) or record.left_from_drogue is None:
-        return False
-    truth_m = record.left_from_drogue.translation_m
-    error_m = float(np.linalg.norm(answer.left_from_drogue.translation_m - truth_m))
-    return error_m <= most_fraction * float(np.linalg.norm(truth_m))
-
-
-def _found_boxes(images: Sequence[ImageTruth], path: Path, image_ids: frozenset[int]) -> dict[int, tuple[int, int]]:
-    """By frame: in how many of its images the sought drogue is found, and in how many it is to be found."""
-    matches = Evaluation(images, read_detections(path, image_ids)).matches(images)
-    best = best_f1(matches)
-    is_found = matches.found_scores() >= (math.inf if best is None else best.threshold)
-    shares: dict[int, tuple[int, int]] = {}
-    for image, is_shown, found in zip(matches.images, matches.has_drogue, is_found, strict=True):
-        if is_shown:
-            hits, count = shares.get(image.frame_index, (0, 0))
-            shares[image.frame_index] = hits + int(found), count + 1
-    return shares
-
-
 def _crossing(
     domain: DesignDomain,
     crossing: Crossing,
     placed: dict[int, dict[str, Placed]],
-    solved: dict[int, dict[str, tuple[int, int]]],
+    solved: SolvedCases,
 ) -> CrossingCoverage:
     tally = _Tally()
     for index, bins in placed.items():

@@ -1,4 +1,4 @@
-"""Commands that tell what datasets cover, and how they differ: coverage, diff."""
+"""Commands that tell what datasets cover, how they differ, and what to render next: coverage, diff, mine."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ EXAMPLES = {
         "droguekit coverage data/world --html coverage.html",
         "droguekit coverage data/world --odd my-domain.toml --json coverage.json",
         "droguekit coverage data/world --estimates estimates.jsonl --detections boxes.json --html coverage.html",
+    ),
+    "mine": (
+        "droguekit mine data/world --detections boxes.json --out mined.toml",
+        "droguekit mine data/world --estimates estimates.jsonl --method joint-hub --kept 0.7 --out mined.toml",
     ),
     "diff": (
         "droguekit diff data/world data/world-2",
@@ -93,6 +97,56 @@ def diff(
         typer.echo(f"wrote {html}")
     if found.differs:
         raise typer.Exit(FAULT)
+
+
+def mine(
+    dataset: DatasetArgument,
+    out: Annotated[Path, output_option("--out", "FILE.toml", "Write the new recipe; its name is the file's.")],
+    estimates: Annotated[
+        Path | None, typer.Option("--estimates", metavar="FILE.jsonl", help="Poses whose failures count.")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option("--detections", metavar="FILE.json", help="Boxes whose failures count.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", metavar="NAME", help="Whose failures, where there are several.")
+    ] = None,
+    kept: Annotated[
+        float, typer.Option("--kept", metavar="SHARE", help="Share of the frames that follow the old laws.")
+    ] = 0.5,
+    distance_bins: Annotated[
+        int, typer.Option("--distance-bins", metavar="N", help="Bins of distance, with equally many frames before.")
+    ] = 8,
+    position_error: Annotated[
+        float, typer.Option("--position-error", metavar="SHARE", help="Of the distance, up to which a pose is solved.")
+    ] = 0.01,
+    count: Annotated[int | None, typer.Option("--count", metavar="N", help="Pairs of the new recipe.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", metavar="N", help="Its seed; the old one plus 1.")] = None,
+    recipe: Annotated[
+        Path | None,
+        typer.Option("--recipe", metavar="FILE.toml", help="The recipe that the dataset was rendered from."),
+    ] = None,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Write the shares.")] = None,
+) -> None:
+    """Write a recipe that draws more of what a detector or an estimator fails at.
+
+    A share of the frames (--kept) follows the laws of before, the others the failures under them: by family, by drogue
+    and by distance.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from datasets_manifest.recipe.recipe import parse_recipe
+    from droguekit.assurance.hard_example_mining import MiningChoices, mine_recipe, mined_lines
+
+    choices = MiningChoices(method, kept, distance_bins, position_error, seed, count, recipe)
+    boxes = () if detections is None else (detections,)
+    mined = mine_recipe(dataset, out.stem, choices, estimates, boxes, progress_report())
+    parse_recipe(mined.text, out.parent)
+    for line in mined_lines(mined):
+        typer.echo(line)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_text_atomic(out, mined.text)
+    typer.echo(f"wrote {out}")
+    _write_numbers(mined, json_)
 
 
 def _write_numbers(found: FrozenModel, out: Path | None) -> None:

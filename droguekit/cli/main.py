@@ -46,6 +46,7 @@ COMMANDS = {
         "droguekit.cli.assurance_commands", "Count a dataset's pairs in the cells of an operational design domain."
     ),
     "diff": Command("droguekit.cli.assurance_commands", "Tell how two datasets differ beyond chance."),
+    "mine": Command("droguekit.cli.assurance_commands", "Write a recipe that draws more of what fails."),
     "reproduce": Command("droguekit.cli.dataset_commands", "Render one frame of a dataset again and compare."),
     "export": Command("droguekit.cli.exchange_commands", "Write a dataset's labels in another format."),
     "preview": Command("droguekit.cli.viewing_commands", "Draw a contact sheet of a dataset with its labels."),

@@ -12,7 +12,7 @@ from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
-from scenes.framing import sample_distance_m
+from scenes.framing import distance_at, sample_distance_m
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 from tests.support.recipe_builder import RecipeTable, between, build_recipe, stations
 
@@ -143,6 +143,38 @@ def test_an_attitude_that_never_fits_is_one_clear_error() -> None:
     drawn = recipe(distance=stations(1.47), pose={"pitch_deg": 0, "yaw_deg": [40, 45]})
     with pytest.raises(ValueError, match="no attitude within the recipe's ranges"):
         sample_frame(drawn, 0)
+
+
+@pytest.mark.parametrize("law", ["uniform", "log-uniform", "uniform-image-size"])
+def test_bins_of_distance_get_their_weights_and_keep_the_law_inside(law: str) -> None:
+    plain = DistanceLaw(law=law, low_m=2.0, high_m=32.0)
+    binned = DistanceLaw(law=law, low_m=2.0, high_m=32.0, edges_m=(2.0, 4.0, 16.0, 32.0), weights=(1.0, 0.0, 3.0))
+    shares = np.linspace(0.0, 1.0, 4001, endpoint=False)
+    drawn = np.array([distance_at(binned, share) for share in shares])
+    np.testing.assert_allclose(np.histogram(drawn, (2, 4, 16, 32.001))[0] / 4001, [0.25, 0.0, 0.75], atol=1e-3)
+    for low_m, high_m, first, last in ((2.0, 4.0, 0.0, 0.25), (16.0, 32.0, 0.25, 1.0)):
+        inside = DistanceLaw(law=law, low_m=low_m, high_m=high_m)
+        middle = distance_at(binned, 0.5 * (first + last))
+        # Each bin is drawn by the law between its own ends.
+        assert middle == pytest.approx(distance_at(inside, 0.5), rel=1e-12)
+    whole = DistanceLaw(law=law, low_m=2.0, high_m=32.0, edges_m=(2.0, 32.0), weights=(7.0,))
+    assert [distance_at(whole, share) for share in (0.1, 0.7)] == [distance_at(plain, share) for share in (0.1, 0.7)]
+    assert "edges_m" not in plain.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"edges_m": (2.0, 32.0)}, "need each other"),
+        ({"edges_m": (2.0, 31.0), "weights": (1.0,)}, "begin with low_m"),
+        ({"edges_m": (2.0, 9.0, 8.0, 32.0), "weights": (1.0, 1.0, 1.0)}, "ascend"),
+        ({"edges_m": (2.0, 8.0, 32.0), "weights": (1.0,)}, "one for each of 2 bins"),
+        ({"edges_m": (2.0, 32.0), "weights": (0.0,)}, "not all be zero"),
+    ],
+)
+def test_wrong_bins_of_distance_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        DistanceLaw(law="uniform", low_m=2.0, high_m=32.0, **wrong)
 
 
 def quantile_error(law: DistanceLaw, transform: Callable[..., Any]) -> float:

@@ -1,0 +1,165 @@
+"""Recipes that follow failures, against shares worked out by hand and against the frames that they draw."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
+from datasets_manifest.types.records import PairRecord
+from droguekit.assurance.hard_example_mining import MinedRecipe, MiningChoices, mine_recipe
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+from geometry.se3 import RigidTransform
+from scenes.drogue_appearance import drogue_of_scene
+from scenes.sampler import recipe_of_scene, sample_left_from_drogue
+from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
+from tests.support.small_datasets import rendered
+
+PRIOR = 4.0
+
+
+def text_of(**changes: Any) -> str:
+    variants = [{"drogue": "red-8", "weight": 3}, {"drogue": "red-5"}]
+    families = [
+        {"name": "clear", "weight": 3, "environment": {"sun_elevation_deg": [30, 60]}},
+        {"name": "low-sun", "environment": {"sun_elevation_deg": [5, 10]}},
+    ]
+    given = {
+        "name": "mined",
+        "seed": 4,
+        "rig": RIG_160_PX,
+        "frames": {"count": 40, "scenes": 20, "empty_fraction": 0.1},
+        "distance": between(2.0, 32.0, "log-uniform"),
+        "target": {"variants": variants},
+        "families": families,
+        "render": {"engine": "analytic"},
+    }
+    return recipe_text(**(given | changes))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rendered(text_of(), tmp_path_factory.mktemp("mined") / "dataset")
+
+
+def is_hard(record: PairRecord) -> bool:
+    """Planted: what fails is far away and looked at in low sun."""
+    distance_m = record.conditions.distance_m
+    return distance_m is not None and distance_m > 8.0 and record.conditions.family == "low-sun"
+
+
+def write_failures(dataset: Path, out: Path, method: str = "planted") -> Path:
+    source = Dataset(dataset)
+    answers: list[PoseEstimate | NoFix] = []
+    for record in source.records():
+        pose = record.left_from_drogue
+        if pose is None:
+            continue
+        moved = RigidTransform(pose.rotation, pose.translation_m * (1.1 if is_hard(record) else 1.001))
+        answers.append(
+            PoseEstimate(
+                frame_index=record.frame_index,
+                time_s=record.frame.time_s,
+                method=method,
+                left_from_drogue=moved,
+                covariance=np.eye(6) * 1e-4,
+                modes=(),
+                features=(),
+            )
+        )
+    write_estimates(out, answers)
+    return out
+
+
+def mined_of(dataset: Path, folder: Path, **choices: Any) -> MinedRecipe:
+    return mine_recipe(dataset, "harder", MiningChoices(**choices), write_failures(dataset, folder / "poses.jsonl"))
+
+
+def test_shares_are_what_the_objective_says(dataset: Path, tmp_path: Path) -> None:
+    mined = mined_of(dataset, tmp_path, kept=0.4, distance_bins=4)
+    records = [record for record in Dataset(dataset).records() if record.left_from_drogue is not None]
+    laws = {law.of: law for law in mined.laws}
+    assert set(laws) == {"families", "distance", "drogues"}
+    mean = sum(is_hard(record) for record in records) / len(records)
+    keys = {
+        "families": lambda record: record.conditions.family,
+        "distance": lambda record: int(np.log2(record.conditions.distance_m / 2.0)),
+        "drogues": lambda record: record.frame.drogue.name,
+    }
+    names = {"families": ["clear", "low-sun"], "distance": [0, 1, 2, 3], "drogues": ["red-8", "red-5"]}
+    before = {"families": [0.75, 0.25], "distance": [0.25] * 4, "drogues": [0.75, 0.25]}
+    for law, key in keys.items():
+        cases = Counter(key(record) for record in records)
+        failures = Counter(key(record) for record in records if is_hard(record))
+        fraction = np.array([(failures[name] + PRIOR * mean) / (cases[name] + PRIOR) for name in names[law]])
+        share = np.array(before[law])
+        expected = 0.4 * share + 0.6 * share * fraction / (share @ fraction)
+        np.testing.assert_allclose([place.after for place in laws[law].bins], expected, rtol=1e-12)
+        assert sum(place.failures for place in laws[law].bins) == sum(is_hard(record) for record in records) > 3
+
+
+def test_the_new_recipe_draws_what_it_says(dataset: Path, tmp_path: Path) -> None:
+    mined = mined_of(dataset, tmp_path, kept=0.3, distance_bins=4, count=4000)
+    recipe = parse_recipe(mined.text)
+    assert (recipe.name, recipe.seed, recipe.frames.count, recipe.frames.scenes) == ("harder", 5, 4000, 2000)
+    scenes = [recipe_of_scene(recipe, scene_id) for scene_id in range(2000)]
+    drogues = [drogue_of_scene(own, scene_id).name for scene_id, own in enumerate(scenes)]
+    poses = [sample_left_from_drogue(recipe, index) for index in range(0, 4000, 4)]
+    far = np.mean([pose.translation_m[2] > 8.0 for pose in poses if pose is not None])
+    low = np.mean([own.family == "low-sun" for own in scenes])
+    laws = {law.of: {place.name: place.after for place in law.bins} for law in mined.laws}
+    # Three binomial deviations of 900 frames, and of 2000 scenes.
+    assert far == pytest.approx(sum(list(laws["distance"].values())[2:]), abs=0.05)
+    assert low == pytest.approx(laws["families"]["low-sun"], abs=0.035)
+    assert np.mean([name == "red-5" for name in drogues]) == pytest.approx(laws["drogues"]["red-5"], abs=0.035)
+    assert far > 0.65 and low > 0.45
+
+
+def test_keeping_everything_keeps_the_laws_and_mining_again_goes_on(dataset: Path, tmp_path: Path) -> None:
+    same = mined_of(dataset, tmp_path, kept=1.0)
+    assert all(place.after == pytest.approx(place.before, rel=1e-12) for law in same.laws for place in law.bins)
+    first = mined_of(dataset, tmp_path, kept=0.5, distance_bins=4, count=24)
+    assert first.text == mined_of(dataset, tmp_path, kept=0.5, distance_bins=4, count=24).text
+    again = rendered(first.text, tmp_path / "again")
+    second = mined_of(again, tmp_path, distance_bins=7)
+    law = {law.of: law for law in second.laws}["distance"]
+    written = tomllib.loads(first.text)["distance"]
+    assert len(law.bins) == 4
+    np.testing.assert_allclose([place.before for place in law.bins], np.array(written["weights"]) / 4, atol=1e-4)
+
+
+def test_the_command_writes_a_recipe_and_tells_the_shares(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses, out = write_failures(dataset, tmp_path / "poses.jsonl"), tmp_path / "new" / "harder.toml"
+    assert run(["mine", str(dataset), "--estimates", str(poses), "--out", str(out)]) == DONE
+    told = capsys.readouterr().out
+    assert "low-sun" in told and "25.0 % ->" in told and f"wrote {out}" in told
+    assert out.read_text().startswith("# Mined from mined (")
+    assert parse_recipe(out.read_text(), out.parent).distance.weights is not None
+
+
+def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses, out = write_failures(dataset, tmp_path / "poses.jsonl"), tmp_path / "harder.toml"
+    plain = ["mine", str(dataset), "--out", str(out)]
+    for extra, words in (
+        ([], "give --estimates or --detections"),
+        (["--estimates", str(poses), "--method", "other"], "there are planted"),
+        (["--estimates", str(poses), "--kept", "1.5"], "--kept: must be from 0 to 1"),
+        (["--estimates", str(poses), "--distance-bins", "0"], "--distance-bins: must be from 1 to 100"),
+        (["--estimates", str(poses), "--position-error", "0.9"], "solves every case"),
+    ):
+        assert run([*plain, *extra]) == WRONG_INPUT
+        assert words in capsys.readouterr().err
+    changed = tmp_path / "other.toml"
+    changed.write_text(text_of(distance=between(2.0, 30.0)))
+    assert run([*plain, "--estimates", str(poses), "--recipe", str(changed)]) == WRONG_INPUT
+    assert "give its file with --recipe" in capsys.readouterr().err
+    assert not out.exists()
