@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-RENDER_VERSION = "10"
+RENDER_VERSION = "11"

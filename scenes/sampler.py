@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import Family, Recipe
@@ -12,6 +13,7 @@ from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder
 from datasets_manifest.types.appearance import PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
+from datasets_manifest.types.video_camera import CAMERA_BAND_NM
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters
 from drogue_models.surface_looks import HoseLook
 from drogue_models.tankers.tanker import Tanker
@@ -35,6 +37,8 @@ SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 FRAME_PERIOD_S = 0.04  # 25 pairs per second
 # Grid of directions at which the exposure meter looks.
 _METER_COLUMNS, _METER_ROWS = 16, 12
+# Of a view that is metered by its highlights, this share may be white.
+_WHITE_SHARE = 0.1
 _DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; the limits of time and gain are reached long before
 
 
@@ -136,7 +140,9 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         environment = _environment_of_sequence(environment, kinematics)
     rig = scene_recipe.rig
     sensor, camera = camera_of_scene(scene_recipe, scene_id)
-    exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
+    is_infrared = camera is not None and camera.spectrum == "near-infrared"
+    metered = sensor.model_copy(update={"band_nm": CAMERA_BAND_NM}) if is_infrared else sensor
+    exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, metered)
     condition = None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue)
     if pose is not None:
         condition = blinking_condition(condition, drogue, kinematics.time_s, exposure.time_s)
@@ -322,6 +328,10 @@ def automatic_exposure(
     if law.auto_meter == "view":
         view = _view(ambient, camera, world_from_left)
         brightest = max(brightest, float(light_in_band(view, sensor.band_nm).mean()))
+    elif law.auto_meter == "highlights":
+        pixels = light_in_band(_pixels(ambient, camera, world_from_left), sensor.band_nm)
+        white = law.auto_level_fraction * float(np.quantile(pixels, 1.0 - _WHITE_SHARE))
+        brightest = max(brightest, float(pixels.mean()), white)
     one_second = Exposure(time_s=1.0, f_number=law.f_number)
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
     time_s = law.time_s
@@ -334,9 +344,31 @@ def automatic_exposure(
 
 def _view(ambient: EnvironmentRadiance, camera: PinholeCamera, world_from_left: RigidTransform) -> Radiance:
     """(H, W, 3) coarse picture of the camera's view without a drogue. [cd/m2]"""
+    return ambient.radiance(_directions(camera, world_from_left, *_meter_grid(camera, _METER_COLUMNS, _METER_ROWS)))
+
+
+def _pixels(ambient: EnvironmentRadiance, camera: PinholeCamera, world_from_left: RigidTransform) -> Radiance:
+    """(1, 2 N, 3) light of pixels all over the camera's view without a drogue, in pairs of neighbours. [cd/m2]
+
+    What a ray sees is averaged up to its neighbour in the array: rays far apart see less of bright clouds.
+    """
+    # An odd number of pairs: the middle, whose neighbour decides, is the second of a pair.
+    u, v = (grid.ravel() for grid in _meter_grid(camera, _METER_COLUMNS + 1, _METER_ROWS + 1))
+    u, v = np.stack([u, u + 1.0], axis=-1).reshape(1, -1), np.repeat(v, 2)[None]
+    return ambient.radiance(_directions(camera, world_from_left, u, v))
+
+
+def _meter_grid(camera: PinholeCamera, columns: int, rows: int) -> tuple[Array, Array]:
+    """Two (rows, columns) coordinates of evenly spaced places in the picture. [px]"""
     u, v = np.meshgrid(
-        (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
-        (np.arange(_METER_ROWS) + 0.5) * camera.height_px / _METER_ROWS,
+        (np.arange(columns) + 0.5) * camera.width_px / columns, (np.arange(rows) + 0.5) * camera.height_px / rows
     )
-    rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
-    return ambient.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
+    return u, v
+
+
+def _directions(
+    camera: PinholeCamera, world_from_left: RigidTransform, u_px: Array, v_px: Array
+) -> NDArray[np.float32]:
+    """(..., 3) unit vectors in world axes through places in the left picture."""
+    rays = world_from_left.rotate(camera.rays(np.stack([u_px, v_px], axis=-1)))
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)

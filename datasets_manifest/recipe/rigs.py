@@ -227,7 +227,8 @@ class ExposureLaw(FrozenModel):
         time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
         auto_gain: range of the gain; a single number is a fixed gain.
         auto_meter: what the meter measures: `view`, the brighter of the view's mean and a white plate that faces the
-            camera; or `plate`, the plate alone, as a meter that measures the drogue and not the sky behind it.
+            camera; `plate`, the plate alone, as a meter that measures the drogue and not the sky behind it; or
+            `highlights`, as `view`, but nine tenths of the view stay below white.
         auto_level_fraction: level at which the meter puts that, as a share of the full well or, at gains other than 1,
             of the signal that saturates the converter.
     """
@@ -235,7 +236,7 @@ class ExposureLaw(FrozenModel):
     time_s: float | None = Field(default=None, gt=0, le=1)
     auto_time_s: Range = Range(low=20e-6, high=20e-3)
     auto_gain: Range = Range(low=1, high=1)
-    auto_meter: Literal["view", "plate"] = Field(default="view", exclude_if=lambda meter: meter == "view")
+    auto_meter: Literal["view", "plate", "highlights"] = Field(default="view", exclude_if=lambda meter: meter == "view")
     auto_level_fraction: float = Field(default=0.7, gt=0, le=2)
     f_number: float = Field(default=2.8, ge=0.5, le=64)
 

@@ -13,6 +13,8 @@ from datasets_manifest.types.field_types import Fraction
 from drogue_models.frozen_model import FrozenModel
 
 Spectrum = Literal["colour", "grey", "near-infrared"]
+# Of drawn cameras for the near infrared, as of the rig behind a filter. [nm]
+CAMERA_BAND_NM = 850.0
 
 
 class LensFlaws(FrozenModel):

@@ -16,6 +16,10 @@ from geometry.compiled_loops import compiled
 
 Plane = NDArray[np.float32]
 _LEVELS = 256
+# Noise at the mean level that doubles the widths of denoising [of 255 levels], and the most by which they grow.
+_NOISE_DOUBLING, _MOST_WIDENING = 8.0, 2.5
+# Colours are made stronger, but not those that are strong; those of highlights fade by up to a half.
+_HIGHLIGHT_LEVEL, _FADING = 165.0, 0.5
 # Cameras know the colours that daylight and lamps have, and correct no others.
 _MOST_GAIN = 1.6
 
@@ -37,18 +41,20 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
     detail = np.array([processing.kept_detail_fraction, 1.0 + processing.sharpen], dtype=np.float32)
     noise = noise_by_level(frame, processing)
     faint: Plane = np.square(np.maximum(processing.denoise_threshold * noise, 1e-3), dtype=np.float32)
+    # The darker it was, the wider processors average.
+    wider = 1.0 + min(float(noise[round(float(tables[1][raw].mean()))]) / _NOISE_DOUBLING, _MOST_WIDENING)
     if frame.is_monochrome:
         luma = tables[1][raw]
         grey = np.empty(raw.shape, np.uint8)
-        _finish_grey(luma, _blurred(luma, processing.denoise_sigma_px), detail, faint, grey)
+        _finish_grey(luma, _blurred(luma, wider * processing.denoise_sigma_px), detail, faint, grey)
         return grey
     code = cv2.COLOR_BayerRGGB2RGB_EA if processing.demosaic == "edge-aware" else cv2.COLOR_BayerRGGB2RGB
     linear = cv2.cvtColor(raw, code)
     luma, blue, red = (np.empty(raw.shape, np.float32) for _ in range(3))
     _split(linear, tables, np.float32(processing.saturation), luma, blue, red)
     picture = np.empty(linear.shape, np.uint8)
-    blue, red = (_blurred_chroma(plane, processing.chroma_blur_px) for plane in (blue, red))
-    _finish(luma, _blurred(luma, processing.denoise_sigma_px), blue, red, detail, faint, picture)
+    blue, red = (_blurred_chroma(plane, wider * processing.chroma_blur_px) for plane in (blue, red))
+    _finish(luma, _blurred(luma, wider * processing.denoise_sigma_px), blue, red, detail, faint, picture)
     return picture
 
 
@@ -142,9 +148,13 @@ def _split(
             g = tables[1, linear[row, column, 1]]
             b = tables[2, linear[row, column, 2]]
             y = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
+            strong = max(abs(b - y), abs(r - y)) / np.float32(_LEVELS)
+            bright = max(y - np.float32(_HIGHLIGHT_LEVEL), np.float32(0.0)) / np.float32(255.0 - _HIGHLIGHT_LEVEL)
+            amount = np.float32(1.0) + (saturation - np.float32(1.0)) * (np.float32(1.0) - strong)
+            amount *= np.float32(1.0) - np.float32(_FADING) * bright * bright
             luma[row, column] = y
-            blue[row, column] = saturation * (b - y)
-            red[row, column] = saturation * (r - y)
+            blue[row, column] = amount * (b - y)
+            red[row, column] = amount * (r - y)
 
 
 @compiled

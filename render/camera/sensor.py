@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import bulk_frame_generator
 from datasets_manifest.types.frame import FrameSpec, Sensor
 from datasets_manifest.types.images import Pixels, StereoImages, srgb_from_light
-from datasets_manifest.types.video_camera import ImageProcessing
+from datasets_manifest.types.video_camera import CAMERA_BAND_NM, ImageProcessing
 from geometry.stereo import EYES, Eye
 from render.camera.image_coding import deliver
 from render.camera.image_processing import develop, metered
@@ -27,8 +27,6 @@ from scenes.sky.photometry import infrared_light, infrared_weights
 
 # Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
 MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
-# Of drawn cameras for the near infrared, as of the rig behind a filter. [nm]
-_CAMERA_BAND_NM = 850.0
 # Sites of the RGGB mosaic: channel, first row, first column.
 _MOSAIC_SITES = ((0, 0, 0), (1, 0, 1), (1, 1, 0), (2, 1, 1))
 
@@ -106,7 +104,7 @@ def _sample_sites(seen: NDArray[np.float32], frame: FrameSpec) -> NDArray[np.flo
     camera, color = frame.camera, frame.sensor.color
     if frame.is_monochrome:
         if camera is not None and camera.spectrum == "near-infrared":
-            return infrared_light(seen, _CAMERA_BAND_NM)
+            return infrared_light(seen, CAMERA_BAND_NM)
         return monochrome_light(seen, frame.sensor)
     if color == "rgb" and (camera is None or camera.processing is None):
         return seen

@@ -39,7 +39,7 @@ THIN_KINDS = ("cirrus", "contrail", "rain")
 _FADING_RISE, _FADING_RISE_AT_GROUND = 0.005, 1e-4
 _COVER_SAMPLES, _MOST_THRESHOLD, _THRESHOLD_BISECTIONS = 96, 12.0, 14
 # Height over thickness at which the bodies of a shape are widest.
-_WIDEST_AT = {HEAP: 0.14, SHEET: 0.45, CELLS: 0.5}
+_WIDEST_AT = {HEAP: 0.28, SHEET: 0.45, CELLS: 0.5}
 # With this as the smallest detail only the larger shape is left. [m]
 _LARGER_SHAPE_M = 1e6
 # Width of a shadow's edge in units of the larger shape.
@@ -47,7 +47,7 @@ _SHADOW_EDGE = 0.22
 # Light that droplets turned once, a few times and often: each time less is left of the forward peak, and what is left
 # reaches deeper. Share, asymmetry, extinction over that of the beam (Wrenninge 2013, doi:10.1145/2504435.2504451).
 _FORWARD = ((0.22, 0.8, 1.0), (0.3, 0.6, 0.3), (0.2, 0.35, 0.08))
-_CREASE, _THIN, _RIM, _VEIL = 0.45, 0.75, 0.45, 0.2
+_CREASE, _THIN, _LEAVES, _RIM, _VEIL = 0.8, 0.75, 0.55, 0.45, 0.2
 # Step between the first rays of a large picture, and how much of the way to the nearest cloud around is free of it.
 _FIRST_STEP_PX, _BEFORE_CLOUD, _ROW = 8, 0.96, 256
 # Steps between further rays, of which those are marched whose neighbours, twice as far apart, differ more than this.
@@ -378,6 +378,9 @@ def _shade(
     multiple = (0.5 * np.exp(-0.2 * towards_sun) + 0.42 / (1.0 + BACK_SCATTER * towards_sun)) / np.float32(np.pi)
     # Where there is little cloud, little is scattered more than once.
     multiple *= 1.0 - np.float32(_THIN) * np.exp(-found[..., 0])
+    # Light that is turned often leaves a cloud near the surface that it came in by; seen from behind, that is dark.
+    against = np.clip(0.3 + 1.4 * cosine, 0.0, 1.0)
+    multiple *= 1.0 - np.float32(_LEAVES) * against * np.exp(-towards_sun)
     if layer.kind in ("cumulus", "congestus"):
         # The rim of a base sees the dark side of its own cloud.
         multiple *= np.float32(_RIM) + np.float32(1.0 - _RIM) * np.minimum(2.5 * height, 1.0)
@@ -387,7 +390,7 @@ def _shade(
     from_above = (0.85 / np.pi) / (1.0 + np.float32(BACK_SCATTER) * overhead) * (0.6 + 0.4 * height)
     from_below = (0.75 / np.pi) * (1.0 - 0.75 * height)
     # Less of the sky is seen from between lumps.
-    open_share = np.clip(1.0 + np.float32(_CREASE) * relief, 0.4, 1.3)
+    open_share = np.clip(1.0 + np.float32(_CREASE) * relief, 0.25, 1.3)
     out = ((forward + multiple) * (0.5 + 0.5 * open_share))[..., None] * light.beam_lux.astype(np.float32)
     out += (from_above * open_share)[..., None] * light.sky_lux.astype(np.float32)
     out += (from_below * open_share)[..., None] * light.ground_lux.astype(np.float32)

@@ -23,6 +23,10 @@ _SUN_STEPS = 5
 # Each octave of lumps is finer by this factor and turned by these cosines and sines about two axes.
 _FINER = 2.13
 _MASK, _TILE_PX, _LUMPS_MASK = 511, 512.0, 63
+# Lumps grow on the surface, and outside it down to this share of their amount.
+_LUMP_REACH = 0.3
+# Heaps of cloud are narrower below this share of their height, by so much at the base.
+_ROUND_BELOW, _UNDERCUT = 0.3, 0.9
 _BLOB_TEXELS, _LUMP_TEXELS = 64.0, 64.0 / 6.0
 
 
@@ -53,6 +57,14 @@ def lump_at(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
     e += b * (f - e)
     g += b * (h - g)
     return float(e + c * (g - e))
+
+
+@compiled
+def _with_lump(excess: float, amount: float, lump: float) -> float:
+    """An excess with a lump on it, which is less outside than on the surface, for no lump floats alone."""
+    if lump > 0.0 and excess < 0.0:
+        lump *= max(1.0 + excess / (_LUMP_REACH * amount), 0.0)
+    return float(excess + amount * lump)
 
 
 @compiled
@@ -91,7 +103,9 @@ def excess_at(
     lx, ly, lz = x_m * lumps_per_m + shift, y_m * lumps_per_m + 0.37 * shift, height_m * lumps_per_m
     if kind == HEAP:
         square = h * h
-        fall = shape[12] * square + shape[13] * square * square
+        # Bodies are rounded below, so that the sun does not shine through their lower rims.
+        under = max(1.0 - h * (1.0 / _ROUND_BELOW), 0.0)
+        fall = shape[12] * square + shape[13] * square * square + _UNDERCUT * under * under
         wide = tile_at(body, u, v) - threshold
         wide /= 1.0 + 0.25 * max(wide, 0.0)
         # The most that lumps of all sizes can add.
@@ -100,10 +114,10 @@ def excess_at(
             return float(most)
         swell = lump_at(lumps, lx, ly, lz)
         turret = lump_at(lumps, 2.2 * ly + 0.3, 2.2 * lz, 2.2 * lx)
-        excess = wide + lump_amount * (0.35 + h) * (swell + 0.5 * turret) - fall
-        excess *= metric_m
+        amount = lump_amount * (0.35 + h)
+        excess = metric_m * (wide + amount * (swell + 0.5 * turret) - fall)
         floor = height_m - 0.03 * thick_m * (1.0 - swell)
-        fine = min(max(0.15 + 3.5 * h, 0.15), 1.0)
+        fine = min(max(0.35 + 2.5 * h, 0.35), 1.0)
         excess = min(excess, floor)
     elif kind == SHEET:
         swell = lump_at(lumps, lx, ly, 0.6 * lz)
@@ -130,7 +144,7 @@ def excess_at(
             return float(excess + 0.33 * remaining_m)
         if excess - remaining_m > deep_m:
             return float(excess - remaining_m)
-        excess += amount_m * min(seen - 1.0, 1.0) * lump_at(lumps, px, py, pz)
+        excess = _with_lump(excess, amount_m * min(seen - 1.0, 1.0), lump_at(lumps, px, py, pz))
         remaining_m -= amount_m
         amount_m *= gain
         seen *= 1.0 / _FINER
@@ -221,7 +235,7 @@ def march_rays(
                             low_m, low, high = middle_m, min(value, -1e-3), 0.5 * high
                 at_m = high_m
                 entry_m = min(entry_m, at_m)
-            soft_m = max(softness_m * (1.0 + 2.5 * max(1.0 - 3.0 * height_m / thick_m, 0.0)), 1.5 * detail_m)
+            soft_m = max(softness_m * (1.0 + 4.0 * max(1.0 - 3.0 * height_m / thick_m, 0.0)), 1.5 * detail_m)
             step_m = max(0.8 / extinction, 0.5 * soft_m, 0.5 * least_m)
             middle_m = at_m + 0.5 * step_m
             height_m = _height_m(z, middle_m, bend, base_m)

@@ -105,6 +105,14 @@ def pair_of(light: NDArray[np.float32], frame: FrameSpec) -> StereoRadiance:
     )
 
 
+def tinted_pair(level: float, tint: tuple[float, float, float], frame: FrameSpec) -> StereoRadiance:
+    """Both eyes see one colour all over."""
+    pair = pair_of(flat_light(level), frame)
+    eye = pair.left
+    coloured = EyeRadiance(**{**vars(eye), "radiance_cd_m2": eye.radiance_cd_m2 * np.array(tint, np.float32)})
+    return StereoRadiance(**{**vars(pair), "left": coloured, "right": coloured})
+
+
 def with_camera(frame: FrameSpec, camera: VideoCamera | None, **sensor: float) -> FrameSpec:
     return frame.model_copy(update={"camera": camera, "sensor": frame.sensor.model_copy(update=sensor)})
 
@@ -260,14 +268,40 @@ def test_white_stays_white_under_a_wrong_white_balance() -> None:
 
 def test_a_flat_colour_keeps_its_colour(frame: FrameSpec) -> None:
     """Through mosaic, interpolation, luma and chroma."""
-    pair = pair_of(flat_light(0.3), frame)
-    tint = np.array([1.0, 0.6, 0.3], np.float32)
-    eye = pair.left
-    coloured = EyeRadiance(**{**vars(eye), "radiance_cd_m2": eye.radiance_cd_m2 * tint})
-    light = StereoRadiance(**{**vars(pair), "left": coloured, "right": coloured})
+    light = tinted_pair(0.3, (1.0, 0.6, 0.3), frame)
     plain = expose(with_camera(frame, None), light).left[20:-20, 20:-20].mean(axis=(0, 1))
     drawn = expose(with_camera(frame, VideoCamera(processing=ImageProcessing())), light).left
     np.testing.assert_allclose(drawn[20:-20, 20:-20].mean(axis=(0, 1)), plain, atol=1.0)
+
+
+@pytest.mark.parametrize(("level", "tint"), [(0.2, (1.0, 0.8, 0.7)), (0.2, (1.0, 0.3, 0.02)), (0.95, (1.0, 0.9, 0.8))])
+def test_saturation_spares_strong_colours_and_highlights_fade(
+    frame: FrameSpec, level: float, tint: tuple[float, float, float]
+) -> None:
+    """A weak colour gains 1.5, a strong one less, and at white half of it is gone."""
+    pair = tinted_pair(level, tint, frame)
+    red, green, blue = expose(with_camera(frame, None), pair).left[20:-20, 20:-20].mean(axis=(0, 1))
+    luma = 0.299 * red + 0.587 * green + 0.114 * blue
+    strength = max(abs(red - luma), abs(blue - luma)) / 256
+    amount = (1.0 + 0.5 * (1.0 - strength)) * (1.0 - 0.5 * (max(luma - 165.0, 0.0) / 90.0) ** 2)
+    drawn = expose(with_camera(frame, VideoCamera(processing=ImageProcessing(saturation=1.5))), pair).left
+    got = drawn[20:-20, 20:-20].mean(axis=(0, 1))
+    # Clipped where a channel would leave the range.
+    expected = np.clip(luma + amount * (np.array([red, blue]) - luma), 0.0, 255.0)
+    np.testing.assert_allclose(got[[0, 2]], expected, atol=2.0)
+
+
+def test_darkness_is_denoised_over_wider_parts(frame: FrameSpec) -> None:
+    """At the same level the noise of a high gain is correlated farther."""
+    farther = []
+    for full_well_e in (20_000.0, 300.0):
+        noisy = with_camera(
+            frame, VideoCamera(processing=PROCESSING), full_well_e=full_well_e, responsivity_e_per_lux_s=full_well_e
+        )
+        pair = expose(noisy, pair_of(flat_light(0.15), noisy))
+        noise = pair.left[..., 1].astype(float) - pair.right[..., 1]
+        farther.append(float(np.corrcoef(noise[:, 3:].ravel(), noise[:, :-3].ravel())[0, 1]))
+    assert farther[1] > farther[0] + 0.1
 
 
 @pytest.mark.parametrize("level", [0.1, 0.7])

@@ -9,11 +9,13 @@ from datasets_manifest.types.environment import CloudKind, CloudLayer, Environme
 from scenes.clouds.cloud_layers import (
     CloudLayerRenderer,
     CloudLight,
+    cloud_shape,
     diffuse_transmission,
     opacity_towards,
     render_cloud_layer,
 )
 from scenes.clouds.cloud_textures import ice_tiles, lump_volume, power_law_tile
+from scenes.clouds.ray_march import layer_excess
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.sky.photometry import direction_from_angles, luminance
@@ -110,6 +112,31 @@ def test_light_under_an_overcast_is_what_two_streams_let_through() -> None:
     share = float(luminance(under.plate_illuminance_lux(up)) / luminance(open_sky.plate_illuminance_lux(up)))
     # The march shades by depth towards the sun, not by two streams: they agree to a third.
     assert share == pytest.approx(diffuse_transmission(stratus), rel=0.35)
+
+
+def test_no_lump_floats_far_from_its_cloud() -> None:
+    """An octave that adds at most l = 0.34 of its amount a on a surface makes cloud of nothing that is deeper than
+    l / (1 + l / 0.3) a < 0.16 a outside; each octave is 0.6 times the one before."""
+    shape = cloud_shape(layer(kind="cumulus", thickness_m=800.0))
+    rng = np.random.default_rng(7)
+    places_m = np.stack([*rng.uniform(0.0, 12_000.0, (2, 40_000)), rng.uniform(0.0, 800.0, 40_000)], axis=-1)
+    larger_m = layer_excess(shape.numbers, shape.body, shape.lumps, places_m, 1e6)
+    detailed_m = layer_excess(shape.numbers, shape.body, shape.lumps, places_m, 1.0)
+    most_m = 0.16 * shape.numbers[8] / (1.0 - 0.6)
+    outside = larger_m < -most_m
+    assert 0.3 < outside.mean() < 0.99 and (detailed_m[outside] < 0.0).all()
+    # Nearer there are some.
+    assert (detailed_m[(larger_m < 0.0) & ~outside] > 0.0).mean() > 0.02
+
+
+def test_cumulus_is_narrower_at_its_base_than_above() -> None:
+    shape = cloud_shape(layer(kind="cumulus", thickness_m=800.0, cover_fraction=0.4))
+    shares = []
+    for height_m in (20.0, 240.0, 640.0):
+        east_m, north_m = np.meshgrid(np.arange(0.0, 12_000.0, 60.0), np.arange(0.0, 12_000.0, 60.0))
+        places_m = np.stack([east_m.ravel(), north_m.ravel(), np.full(east_m.size, height_m)], axis=-1)
+        shares.append((layer_excess(shape.numbers, shape.body, shape.lumps, places_m, 1e6) > 0.0).mean())
+    assert shares[1] > 1.2 * shares[0] and shares[1] > 1.2 * shares[2]
 
 
 def test_edges_towards_the_sun_are_lined_with_silver() -> None:
