@@ -371,4 +371,5 @@ def _directions(
 ) -> NDArray[np.float32]:
     """(..., 3) unit vectors in world axes through places in the left picture."""
     rays = world_from_left.rotate(camera.rays(np.stack([u_px, v_px], axis=-1)))
-    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    directions: NDArray[np.float32] = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return directions
