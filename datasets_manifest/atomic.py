@@ -58,14 +58,15 @@ def open_bytes_atomic(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def _renamed_on_success(path: Path) -> Iterator[Path]:
+def _renamed_on_success(path: Path, is_synced: bool = True) -> Iterator[Path]:
     """A temporary path, which is renamed to `path` when the block ends without an error."""
     part = part_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
         part.replace(path)
-        sync_folder(path.parent)
+        if is_synced:
+            sync_folder(path.parent)
     except OSError as error:
         raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
@@ -96,6 +97,18 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
     """
     with open_bytes_atomic(path) as stream:
         stream.write(data)
+
+
+def write_bytes_unsynced(path: Path, data: bytes) -> None:
+    """Write or replace a file by one rename, without waiting for the disk: for what is easily made anew.
+
+    A killed process leaves the file whole or not at all, but after a power failure it may be damaged.
+
+    Raises:
+        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+    """
+    with _renamed_on_success(path, is_synced=False) as part:
+        part.write_bytes(data)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from datasets_manifest.storage.layout import RECORD_FILE, image_file, is_plain_n
 from datasets_manifest.storage.manifest import Manifest, read_manifest
 from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.storage import Location
-from datasets_manifest.types.field_types import write_rig
+from datasets_manifest.types.field_types import read_rig, write_rig
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import Pixels, StereoImages
 from datasets_manifest.types.records import MOST_TIME_S, PairRecord
@@ -26,7 +26,7 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
 from drogue_models.untrusted_files import parse_json
 from geometry.pinhole import PinholeCamera
-from geometry.stereo import EYES, Eye
+from geometry.stereo import EYES, Eye, StereoRig
 
 
 class Shutter(NamedTuple):
@@ -49,6 +49,8 @@ class Dataset:
         self.path = path
         self.frames = FrameStore(path)
         self.manifest: Manifest = read_manifest(path)
+        # Callers ask for a pair's record, images and hashes in turn, and to parse a record takes longest of all.
+        self._latest: tuple[int, bytes, PairRecord] | None = None
 
     @cached_property
     def frame_indices(self) -> tuple[int, ...]:
@@ -62,6 +64,11 @@ class Dataset:
     @cached_property
     def _rig_table(self) -> dict[str, Any]:
         return write_rig(self.manifest.recipe.rig)
+
+    @cached_property
+    def _rig(self) -> StereoRig:
+        """The rig as every record gives it; they share it."""
+        return read_rig(self._rig_table)
 
     def record(self, frame_index: int) -> PairRecord:
         """The truth of one pair.
@@ -90,19 +97,25 @@ class Dataset:
         return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
 
     def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
+        if self._latest is not None and self._latest[:2] == (frame_index, data):
+            return self._latest[2]
         path = self.frames.where(frame_index, RECORD_FILE)
         table = _parse_table(data, path)
+        frame = table.get("frame")
+        if isinstance(frame, dict) and frame.get("rig") == self._rig_table:
+            frame["rig"] = self._rig
         try:
             record = PairRecord.model_validate(table)
         except ValidationError as error:
             raise ValueError(f"{path}: {explain(error)}") from error
         if record.frame_index != frame_index:
             raise ValueError(f"{path}: frame_index: must be {frame_index}, got {record.frame_index}")
-        if write_rig(record.frame.rig) != self._rig_table:
+        if record.frame.rig is not self._rig and write_rig(record.frame.rig) != self._rig_table:
             raise ValueError(f"{path}: frame.rig: differs from that of the dataset's recipe")
         for name in record.file_sha256:
             if not is_plain_name(name):
                 raise ValueError(f"{path}: file_sha256: must name files of the frame's own folder, got {name!r}")
+        self._latest = (frame_index, data, record)
         return record
 
     def whole_frame(self, frame_index: int) -> tuple[PairRecord, dict[str, bytes]]:
@@ -144,8 +157,19 @@ class Dataset:
             ValueError: a file is missing, truncated or of another size or depth than the rig's; names the file.
         """
         recipe = self.manifest.recipe
-        shutter = read_shutter(self.frames, frame_index)
-        return read_images(self.frames, frame_index, recipe.rig.camera, recipe.sensor, shutter)
+        return read_images(self.frames, frame_index, recipe.rig.camera, recipe.sensor, self.shutter(frame_index))
+
+    def shutter(self, frame_index: int) -> Shutter:
+        """Time stamp, exposure and black level of a pair's images, even where the rest of its record is damaged.
+
+        Raises:
+            ValueError: the record is missing or truncated, or lacks them; names the file.
+        """
+        data = self.frames.read(frame_index, RECORD_FILE)
+        if self._latest is not None and self._latest[:2] == (frame_index, data):
+            record = self._latest[2]
+            return Shutter(record.time_s, record.frame.exposure.time_s, record.image_black_level_dn)
+        return _shutter_of(_parse_table(data, self.frames.where(frame_index, RECORD_FILE)), self.frames, frame_index)
 
     def part_ids(self, frame_index: int, eye: Eye) -> NDArray[np.uint8]:
         """(H, W) part id of every pixel centre.
@@ -207,7 +231,10 @@ def read_shutter(frames: FrameStore, frame_index: int) -> Shutter:
     Raises:
         ValueError: the record is missing or truncated, or lacks them; names the file.
     """
-    table = read_record_table(frames, frame_index)
+    return _shutter_of(read_record_table(frames, frame_index), frames, frame_index)
+
+
+def _shutter_of(table: dict[str, Any], frames: FrameStore, frame_index: int) -> Shutter:
     try:
         values = table["time_s"], table["frame"]["exposure"]["time_s"], table.get("image_black_level_dn", 0.0)
         shutter = Shutter(*(float(value) for value in values))

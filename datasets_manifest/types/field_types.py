@@ -41,7 +41,12 @@ Transform = Annotated[
 """A rigid transform; on disk a 4x4 row-major list."""
 
 
-def _read_rig(value: Any) -> StereoRig:
+def read_rig(value: Any) -> StereoRig:
+    """A rig from what `write_rig` makes of it; a rig itself stays as it is.
+
+    Raises:
+        ValueError: a key is missing or unknown, or a value is wrong.
+    """
     if isinstance(value, StereoRig):
         return value
     if not isinstance(value, dict):
@@ -95,7 +100,7 @@ def _write_lens(lens: Lens) -> dict[str, Any]:
 
 Rig = Annotated[
     InstanceOf[StereoRig],
-    BeforeValidator(_read_rig),
+    BeforeValidator(read_rig),
     PlainSerializer(write_rig, return_type=dict[str, Any]),
 ]
 

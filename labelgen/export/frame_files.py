@@ -13,7 +13,7 @@ import numpy as np
 
 from datasets_manifest.storage.image_codecs import decode_png, encode_png
 from datasets_manifest.storage.layout import image_file
-from datasets_manifest.storage.reader import Dataset, read_shutter
+from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import Pixels, display_table
 from drogue_models.untrusted_files import open_regular
 from geometry.stereo import Eye
@@ -138,7 +138,7 @@ def display_png(source: Dataset, frame_index: int, name: str, bits: ImageBits) -
         ValueError: image or record is missing or damaged; names the file.
     """
     sensor = source.manifest.recipe.sensor
-    black_level_dn = read_shutter(source.frames, frame_index).black_level_dn
+    black_level_dn = source.shutter(frame_index).black_level_dn
     table = display_table(sensor.encoding, sensor.output_bits, black_level_dn, bits)
     shown = np.take(table, _pixels(source, frame_index, name), mode="clip")
     return encode_png(shown.astype(np.uint8) if bits == 8 else shown.astype(np.uint16))

@@ -10,7 +10,7 @@ import pytest
 from datasets_manifest.storage.blind import BlindDataset, BlindPair
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
-from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.reader import Dataset, read_shutter
 
 
 @pytest.mark.parametrize("preset", ["rgb-ideal", "paper-colour", "mono"])
@@ -55,6 +55,21 @@ def test_verify_finds_what_changed(tiny: Path) -> None:
     record.write_bytes(record.read_bytes() + b" ")
     assert dataset.verify(0) == [f"{record}: was changed: its hash differs from the recorded one"]
     assert dataset.verify(2) == [f"{frame_folder(tiny, 2)}: is not in the manifest"]
+
+
+def test_a_record_is_parsed_once_until_it_changes(tiny: Path) -> None:
+    dataset = Dataset(tiny)
+    first = dataset.record(1)
+    assert dataset.record(1) is first
+    assert dataset.shutter(1) == read_shutter(dataset.frames, 1)
+    assert dataset.record(3).frame.rig is first.frame.rig
+    file = frame_folder(tiny, 1) / "record.json"
+    text = file.read_text()
+    file.write_text(text.replace(f'"time_s":{first.time_s}', f'"time_s":{first.time_s + 1}'))
+    assert dataset.shutter(1).time_s == dataset.record(1).time_s == first.time_s + 1
+    file.write_text(text.replace('"baseline_m":', '"baseline_m":1'))
+    with pytest.raises(ValueError, match=r"frame\.rig: differs"):
+        dataset.record(1)
 
 
 def test_damaged_files_are_named(tiny: Path) -> None:

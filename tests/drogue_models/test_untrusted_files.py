@@ -18,6 +18,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import HubParameters
 from drogue_models.presets import MOST_FAULTS, explain
 from drogue_models.untrusted_files import (
+    MOST_DIGITS,
     MOST_MEMORY_BYTES,
     MOST_NESTING,
     limited_memory,
@@ -107,6 +108,16 @@ def test_json_is_read_as_by_the_library(value: object) -> None:
 def test_json_that_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_json(text)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-32"])
+def test_numbers_may_have_so_many_digits(encoding: str) -> None:
+    digits = ("9876543210" * MOST_DIGITS)[:MOST_DIGITS]
+    assert parse_json(f'["\u0664", {digits}]'.encode(encoding)) == ["\u0664", int(digits)]
+    with pytest.raises(ValueError, match=f"a number of {MOST_DIGITS + 1} digits"):
+        parse_json(f"[{digits}0]".encode(encoding))
+    # In a text, and in a float, they are no whole number.
+    assert parse_json(f'["{digits}0", 0.{digits}0]'.encode(encoding))[0] == f"{digits}0"
 
 
 def test_nesting_is_counted_beyond_a_block() -> None:

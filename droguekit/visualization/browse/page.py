@@ -18,17 +18,18 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from datasets_manifest.atomic import PART_SUFFIX, try_lock, write_text_atomic
+from datasets_manifest.atomic import PART_SUFFIX, try_lock, write_bytes_unsynced, write_text_atomic
 from datasets_manifest.storage.storage import Location, absolute
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from droguekit.batch.progress import ProgressReport
-from droguekit.batch.worker_pool import is_accident, run_tasks
+from droguekit.batch.worker_pool import WorkerLimits, is_accident, run_tasks
 from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.visualization.browse.pairs import (
     LIGHTS,
     BrowsedPairs,
     PageEntry,
     PageFacts,
+    is_whole_picture,
     open_browsed_pairs,
     picture_files,
     rings_name,
@@ -104,7 +105,7 @@ def write_labels(out: Path, frame_index: int, labels: dict[str, Any]) -> str:
     """
     text = _json(labels)
     name = f"{frame_index:06d}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    write_text_atomic(_labels_file(out, name), f'droguekit.receive("{name}", {text});\n')
+    write_bytes_unsynced(_labels_file(out, name), f'droguekit.receive("{name}", {text});\n'.encode())
     return name
 
 
@@ -246,9 +247,11 @@ def _write(
     drogues: set[tuple[Ring, ...]] = set()
     skipped: dict[int, UnreadablePair] = {}
     kept = 0
+    # A fresh process would read the manifest of all pairs again.
+    limits = WorkerLimits(tasks_per_process=len(indices))
     report.begin("pairs", len(indices))
     try:
-        with closing(run_tasks(make, indices, workers)) as attempts:
+        with closing(run_tasks(make, indices, workers, limits)) as attempts:
             for attempt in attempts:
                 index = attempt.index
                 if attempt.value is not None:
@@ -283,7 +286,7 @@ class _PictureTask:
         """
         entry = self._source.entry(frame_index)
         files = picture_files(self._out / PICTURES_FOLDER, entry.row["picture"])
-        was_there = all(path.is_file() for path in files)
+        was_there = all(map(is_whole_picture, files))
         if not was_there:
             write_pictures(files, self._source.images(frame_index))
         return entry, was_there

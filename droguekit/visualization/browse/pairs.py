@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import cv2
 
-from datasets_manifest.atomic import write_bytes_atomic
+from datasets_manifest.atomic import write_bytes_unsynced
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import BLIND_FILE, image_file
@@ -39,6 +40,8 @@ _SMALL_WIDTH_PX = 240
 _QUALITY, _SMALL_QUALITY = 85, 78
 # A thousandth of a pixel is far below what a screen shows, and a page of thousands of pairs half as large.
 _PX_DIGITS, _POSE_DIGITS = 3, 9
+# The marker "end of image". Source: ITU-T T.81, B.1.1.3.
+_JPEG_END = b"\xff\xd9"
 
 
 def light_of(luminance_cd_m2: float) -> str:
@@ -209,6 +212,17 @@ def picture_files(folder: Path, stem: str) -> list[Path]:
     return [folder / f"{stem}-{kind}.jpg" for kind in PICTURE_KINDS]
 
 
+def is_whole_picture(path: Path) -> bool:
+    """Whether a JPEG file exists and has its end, which a power failure may have cost it."""
+    try:
+        with path.open("rb") as stream:
+            size = stream.seek(0, os.SEEK_END)
+            stream.seek(max(0, size - len(_JPEG_END)))
+            return stream.read() == _JPEG_END
+    except OSError:
+        return False
+
+
 def write_pictures(files: Sequence[Path], images: StereoImages) -> None:
     """Write a pair's pictures in the sRGB curve.
 
@@ -218,7 +232,7 @@ def write_pictures(files: Sequence[Path], images: StereoImages) -> None:
     left, right = display_picture(images), display_picture(replace(images, left=images.right, right=images.left))
     small, _ = resized(left, min(_SMALL_WIDTH_PX, left.shape[1]))
     for path, picture, quality in zip(files, (small, left, right), (_SMALL_QUALITY, _QUALITY, _QUALITY), strict=True):
-        write_bytes_atomic(path, _jpeg(picture, quality))
+        write_bytes_unsynced(path, _jpeg(picture, quality))
 
 
 def _jpeg(picture: Picture, quality: int) -> bytes:
