@@ -97,8 +97,9 @@ class Dataset:
         return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
 
     def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
-        if self._latest is not None and self._latest[:2] == (frame_index, data):
-            return self._latest[2]
+        known = self._known_record(frame_index, data)
+        if known is not None:
+            return known
         path = self.frames.where(frame_index, RECORD_FILE)
         table = _parse_table(data, path)
         frame = table.get("frame")
@@ -117,6 +118,12 @@ class Dataset:
                 raise ValueError(f"{path}: file_sha256: must name files of the frame's own folder, got {name!r}")
         self._latest = (frame_index, data, record)
         return record
+
+    def _known_record(self, frame_index: int, data: bytes) -> PairRecord | None:
+        """The latest record, if it is that pair's and its file has not changed."""
+        # Another thread may replace it meanwhile.
+        latest = self._latest
+        return latest[2] if latest is not None and latest[:2] == (frame_index, data) else None
 
     def whole_frame(self, frame_index: int) -> tuple[PairRecord, dict[str, bytes]]:
         """The record of a pair, and its other files by name, each read once and checked against its hash.
@@ -166,8 +173,8 @@ class Dataset:
             ValueError: the record is missing or truncated, or lacks them; names the file.
         """
         data = self.frames.read(frame_index, RECORD_FILE)
-        if self._latest is not None and self._latest[:2] == (frame_index, data):
-            record = self._latest[2]
+        record = self._known_record(frame_index, data)
+        if record is not None:
             return Shutter(record.time_s, record.frame.exposure.time_s, record.image_black_level_dn)
         return _shutter_of(_parse_table(data, self.frames.where(frame_index, RECORD_FILE)), self.frames, frame_index)
 

@@ -20,11 +20,14 @@ from typing import Any
 from datasets_manifest.atomic import part_path, write_text_atomic
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage.layout import RECIPE_FILE, RECORD_FILE, frame_folder
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.writer import canonical_json
 from drogue_models.untrusted_files import parse_json
 from droguekit.batch.progress import ProgressReport, progress_report
 from droguekit.batch.render_dataset import render_dataset
 from droguekit.batch.resume import open_dataset
+from render.version import RENDER_VERSION
+from scenes.sampler import split_of_scenes
 
 RESULTS_FILE = "large.json"
 PAIRS = 40
@@ -32,22 +35,11 @@ RECIPE = """
 name = "large"
 seed = 1
 rig = {{ preset = "rgb-ideal", width_px = 96, height_px = 72, focal_px = 160.0 }}
-[frames]
-count = {count}
-scenes = 8
-empty_fraction = 0.1
-[distance]
-law = "uniform"
-low_m = 2.0
-high_m = 20.0
-[environment]
-ground = "sea"
-[render]
-engine = "analytic"
-[split]
-train = 0.5
-val = 0.25
-test = 0.25
+frames = {{ count = {count}, scenes = 8, empty_fraction = 0.1 }}
+distance = {{ law = "uniform", low_m = 2.0, high_m = 20.0 }}
+environment = {{ ground = "sea" }}
+render = {{ engine = "analytic" }}
+split = {{ train = 0.5, val = 0.25, test = 0.25 }}
 """
 # The memory of a process counts from that of the one which starts it, so a small one starts each command.
 _STARTER = """
@@ -61,12 +53,10 @@ cost = {"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss * 1024
         "wall_s": time.monotonic() - began_s, "exit_code": os.waitstatus_to_exitcode(status)}
 print("\\n" + json.dumps(cost))
 """
-# Coverage ends with 1 where cells lack pairs, as they do here.
-_DONE = (0, 1)
 # Until the first picture of the list is there, and until the list follows what was typed.
 _TIME_TILES = """
 async () => {
-  const settled = () => Promise.all([...document.querySelectorAll("#tiles img")].slice(0, 1).map((i) => i.decode()));
+  const settled = () => document.querySelector("#tiles img").decode();
   await settled();
   const first_tile_s = performance.now() / 1e3;
   const field = document.querySelector("[name=text]");
@@ -83,15 +73,7 @@ async () => {
 
 @dataclass(frozen=True)
 class CommandCost:
-    """What a command took.
-
-    Attributes:
-        records: pairs of the dataset.
-        command: in short.
-        cpu_s: of its processes together. [s]
-        peak_mb: memory of its largest process. [MB]
-        wall_s: by the clock. [s]
-    """
+    """What a command took: processor time of its processes, memory of the largest of them, time by the clock."""
 
     records: int
     command: str
@@ -101,16 +83,10 @@ class CommandCost:
 
 
 def build_dataset(out: Path, records: int, pairs: int, report: ProgressReport) -> Path:
-    """The missing frames of a dataset; `droguekit render` then describes it.
-
-    Args:
-        out: folder of the study.
-        records: number of pairs.
-        pairs: of them that are rendered.
-        report: is told of the progress.
+    """Make the missing frames of a dataset, of which only `pairs` are rendered, and its manifest.
 
     Returns:
-        The dataset's folder.
+        The dataset's folder in the folder `out` of the study.
 
     Raises:
         OSError: it cannot be written.
@@ -119,10 +95,13 @@ def build_dataset(out: Path, records: int, pairs: int, report: ProgressReport) -
     render_dataset(_source(pairs), few, range(pairs), 0, report)
     tables = [parse_json((frame_folder(few, index) / RECORD_FILE).read_bytes()) for index in range(pairs)]
     report.say(f"repeating {pairs} pairs into {records}")
-    with open_dataset(dataset, _source(records)):
+    with open_dataset(dataset, source := _source(records)):
         for index in range(records):
             if not frame_folder(dataset, index).exists():
                 _repeat(frame_folder(few, index % pairs), tables[index % pairs], dataset, index)
+        if read_manifest(dataset).counts.pairs < records:
+            splits = split_of_scenes(source.recipe)
+            write_manifest(dataset, build_manifest(dataset, source.recipe, RENDER_VERSION, splits))
     return dataset
 
 
@@ -142,39 +121,27 @@ def _repeat(frame: Path, table: dict[str, Any], dataset: Path, index: int) -> No
 
 
 def command_cost(records: int, name: str, arguments: Sequence[str]) -> CommandCost:
-    """What a `droguekit` command takes in a process of its own.
-
-    Args:
-        records: pairs of the dataset.
-        name: of the command, for the table.
-        arguments: of `droguekit`.
+    """What `droguekit` with these arguments takes in a process of its own.
 
     Raises:
         OSError: the command failed.
     """
     command = [sys.executable, "-m", "droguekit.cli.main", *arguments]
-    ran = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", _STARTER, *command], capture_output=True, text=True, check=True
-    )
+    starter = [sys.executable, "-I", "-S", "-c", _STARTER]
+    ran = subprocess.run([*starter, *command], capture_output=True, text=True, check=True)
     cost = json.loads(ran.stdout.splitlines()[-1])
-    if cost.pop("exit_code") not in _DONE:
+    # Coverage ends with 1 where cells lack pairs, as they do here.
+    if cost.pop("exit_code") not in (0, 1):
         raise OSError(f"droguekit {' '.join(arguments)} failed: {ran.stderr.strip()[-500:]}")
     return CommandCost(records, name, **cost)
 
 
 def page_cost(page: Path, picture: Path) -> dict[str, float]:
-    """What the page of `droguekit browse` takes in a browser, opened from the disk.
-
-    Args:
-        page: its `index.html`.
-        picture: PNG file to write with what it shows.
+    """What a page of `droguekit browse` takes in a browser, which needs playwright; a PNG file gets what it shows.
 
     Returns:
         `first_tile_s` from the call to the first picture, `letter_s` for each letter typed into the text filter, and
-        `heap_mb`, the memory of its scripts' objects.
-
-    Raises:
-        ModuleNotFoundError: playwright is missing.
+        `peak_mb`, the most memory of the tab's process.
     """
     from playwright.sync_api import sync_playwright
 
@@ -186,16 +153,16 @@ def page_cost(page: Path, picture: Path) -> dict[str, float]:
         tab.set_default_timeout(600_000)
         tab.goto(page.resolve().as_uri())
         times: dict[str, float] = tab.evaluate(_TIME_TILES)
-        session = tab.context.new_cdp_session(tab)
-        session.send("HeapProfiler.collectGarbage")
-        times["heap_mb"] = session.send("Runtime.getHeapUsage")["usedSize"] / 1e6
         tab.screenshot(path=picture)
+        processes = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
+        tabs = [Path(f"/proc/{one['id']}/status").read_text() for one in processes if one["type"] == "renderer"]
+        times["peak_mb"] = max(int(text.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6 for text in tabs)
         browser.close()
     return times
 
 
 def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressReport) -> list[CommandCost]:
-    """Measure the commands that have no result yet, in the order of the table.
+    """Measure the commands that have no result yet: those named in `only`, or all.
 
     Args:
         dataset: that `build_dataset` made; results are beside it.
@@ -209,9 +176,10 @@ def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressRe
     Raises:
         OSError: a command failed, or the folder cannot be written.
     """
-    out = dataset.parent
-    known = read_results(out)
-    commands = _commands(dataset, out / f"{records}-made")
+    results = dataset.parent / RESULTS_FILE
+    saved = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
+    known = {key: CommandCost(**cost) for key, cost in saved.items()}
+    commands = _commands(dataset, dataset.parent / f"{records}-made")
     for name, arguments in commands.items():
         if (only and name not in only) or f"{records} {name}" in known:
             continue
@@ -220,7 +188,7 @@ def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressRe
         report.say(f"{name} of {records} pairs")
         known[f"{records} {name}"] = command_cost(records, name, arguments)
         text = json.dumps({key: asdict(cost) for key, cost in known.items()}, indent=1)
-        write_text_atomic(out / RESULTS_FILE, text + "\n")
+        write_text_atomic(results, text + "\n")
     return [known[key] for name in commands if (key := f"{records} {name}") in known]
 
 
@@ -229,7 +197,7 @@ def _commands(dataset: Path, made: Path) -> dict[str, list[str]]:
     recipe, here = str(dataset / RECIPE_FILE), str(dataset)
     return {
         "plan": ["plan", recipe, "--no-probe"],
-        # All pairs are there: it checks their hashes, and writes manifest and annotations.
+        # All pairs are there: it checks their hashes, and writes manifest and annotations, which the next ones need.
         "render": ["render", recipe, "--workers", "1", "--out", here],
         "validate": ["validate", here],
         "coverage": ["coverage", here],
@@ -238,15 +206,6 @@ def _commands(dataset: Path, made: Path) -> dict[str, list[str]]:
         "yolo": ["export", here, "--format", "yolo", "--out", str(made / "yolo")],
         "browse": ["browse", here, "--workers", "1", "--out", str(made / "page")],
     }
-
-
-def read_results(out: Path) -> dict[str, CommandCost]:
-    """The costs in a folder of the study."""
-    try:
-        text = (out / RESULTS_FILE).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return {}
-    return {key: CommandCost(**cost) for key, cost in json.loads(text).items()}
 
 
 def table(costs: Sequence[CommandCost]) -> list[str]:

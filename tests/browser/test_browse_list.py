@@ -150,6 +150,12 @@ def test_thousands_of_pairs_are_shown_in_parts(thousands: Path, open_page: OpenP
     page.click("#page-on")
     page.wait_for_function("document.getElementById('page-place').textContent === 'Page 2 of 117'")
     assert shown_frames(page) == list(range(60, 120))
+    page.fill("#page-number", "117")
+    page.press("#page-number", "Enter")
+    page.wait_for_function("document.getElementById('page-place').textContent === 'Page 117 of 117'")
+    assert shown_frames(page) == list(range(6960, 7000)) and page.input_value("#page-number") == ""
+    page.go_back()
+    page.wait_for_function("document.getElementById('page-place').textContent === 'Page 2 of 117'")
     page.select_option("#filters [name=sequence]", "19")
     assert page.inner_text("#count") == "350 of 7000 pairs" and shown_frames(page)[0] == 19 * 350
     for number, shown in (("1.5", 1), ("1e9", 117), ("-3", 1), ("x", 1), ("117.2", 117)):

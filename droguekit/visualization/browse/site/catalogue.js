@@ -4,21 +4,23 @@
 (function () {
   const catalogue = droguekit.catalogue;
 
+  // Tests of rows by the name of a filter, whose value is read once for all rows.
   const BY = {
-    near: (row, value) => row.distance_m !== null && row.distance_m >= Number(value),
-    far: (row, value) => row.distance_m !== null && row.distance_m <= Number(value),
-    drogue: (row, value) => drogueOf(row) === value,
-    family: (row, value) => row.family === value,
-    split: (row, value) => row.split === value,
-    sequence: (row, value) => String(row.sequence) === value,
-    light: (row, value) => row.light === value,
-    text: (row, value) => {
-      const text = `${row.frame} ${row.text}`;
-      const words = text.split(" ");
-      const found = (word) => (/^\d+$/.test(word) ? words.includes(word) : text.includes(word));
-      return value.toLowerCase().split(/\s+/).filter(Boolean).every(found);
+    near: (value) => (row) => row.distance_m !== null && row.distance_m >= Number(value),
+    far: (value) => (row) => row.distance_m !== null && row.distance_m <= Number(value),
+    drogue: (value) => (row) => drogueOf(row) === value,
+    family: (value) => (row) => row.family === value,
+    split: (value) => (row) => row.split === value,
+    sequence: (value) => (row) => String(row.sequence) === value,
+    light: (value) => (row) => row.light === value,
+    text: (value) => {
+      const words = value.toLowerCase().split(/\s+/).filter(Boolean);
+      const numbers = words.filter((word) => /^\d+$/.test(word));
+      const others = words.filter((word) => !numbers.includes(word));
+      const isIn = (row) => (number) => String(row.frame) === number || row.text.split(" ").includes(number);
+      return (row) => others.every((word) => row.text.includes(word)) && numbers.every(isIn(row));
     },
-    result: (row, value, state) => kindOf(droguekit.resultOf(row, state)) === value,
+    result: (value, state) => (row) => kindOf(droguekit.resultOf(row, state)) === value,
   };
 
   const ORDERS = {
@@ -54,8 +56,9 @@
 
   /** Rows that pass the filters of a state, in its order. */
   droguekit.chosen = function (state) {
-    const tests = Object.entries(BY).filter(([name]) => state[name]);
-    const rows = catalogue.rows.filter((row) => tests.every(([name, test]) => test(row, state[name], state)));
+    const names = Object.keys(BY).filter((name) => state[name]);
+    const tests = names.map((name) => BY[name](state[name], state));
+    const rows = catalogue.rows.filter((row) => tests.every((test) => test(row)));
     if (!Object.hasOwn(ORDERS, state.order ?? "")) return rows;
     const key = ORDERS[state.order];
     const keyed = rows.map((row) => [key(row, state), row]);

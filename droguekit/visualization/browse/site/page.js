@@ -179,6 +179,10 @@
   });
   byId("page-back").addEventListener("click", () => change({ page: pages().page - 1 }, true));
   byId("page-on").addEventListener("click", () => change({ page: pages().page + 1 }, true));
+  byId("page-number").addEventListener("change", ({ target }) => {
+    if (target.value) change({ page: target.value }, true);
+    target.value = "";
+  });
   byId("previous").addEventListener("click", () => step(neighbours().before));
   byId("next").addEventListener("click", () => step(neighbours().after));
   byId("layers").elements.drawn.addEventListener("change", (event) => change({ method: event.target.value }, false));
