@@ -1,0 +1,169 @@
+"""`python -m studies.mining_loop`: trains on as many mined as evenly drawn frames, and compares the worst cells."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.storage.reader import Dataset
+from droguekit.scoring.detection.detection_metrics import Evaluation
+from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
+from droguekit.scoring.results.detection_result import image_id_of, read_detections
+from geometry.stereo import EYES
+
+RECIPE = Path(__file__).with_name("loop.toml")
+ARMS = ("even", "mined")
+EDGES_M = (2.0, 8.0, 16.0, 28.0, 40.0)
+# Student's t for the 95 % interval of the mean, by the number of seeds.
+_T_975 = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}
+_FAMILIES = ("day", "low-sun", "dusk", "haze")
+
+
+def droguekit(*words: object, log: Path) -> None:
+    """Run a command of droguekit, as a user does.
+
+    Raises:
+        OSError: it failed; names the log.
+    """
+    with log.open("a", encoding="utf-8") as lines:
+        command = [sys.executable, "-P", "-m", "droguekit.cli.main", *map(str, words)]
+        ended = subprocess.run(command, stdout=lines, stderr=subprocess.STDOUT, env=dict(os.environ), check=False)
+    if ended.returncode != 0:
+        raise OSError(f"{log}: droguekit {words[0]} ended with {ended.returncode}")
+
+
+def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
+    """Render what is not there yet: the first corpus, an even second one, one to mine in, and one to test on."""
+    base = RECIPE.read_text(encoding="utf-8")
+    even_test = base
+    for family in _FAMILIES:
+        even_test = even_test.replace(f'name = "{family}"\nweight = 8', f'name = "{family}"')
+    texts = {
+        "first": base,
+        "even": base.replace("seed = 1\n", "seed = 2\n", 1),
+        "trial": base.replace("seed = 1\n", "seed = 3\n", 1).replace("count = 150", "count = 300", 1),
+        "test": even_test.replace("seed = 1\n", "seed = 4\n", 1)
+        .replace("count = 150\nscenes = 75", f"count = {test_pairs}\nscenes = {test_pairs // 2}", 1)
+        .replace("train = 0.9\nval = 0.1\ntest = 0.0", "train = 0.0\nval = 0.0\ntest = 1.0", 1),
+    }
+    for name, text in texts.items():
+        recipe = out / f"{name}.toml"
+        write_text_atomic(recipe, text)
+        droguekit("render", recipe, "--out", out / name, "--workers", workers, log=out / "render.log")
+
+
+def train_and_detect(out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int) -> Path:
+    """Train on corpora unless that is done, and write the boxes in a dataset."""
+    folder = out / "trainings" / f"{name}-{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    boxes = folder / f"{dataset}.json"
+    if not boxes.is_file():
+        words = ("--variant", "s", "--image-passes", passes, "--size", "192x256", "--seed", seed, "--threads", 1)
+        sources = [out / corpus for corpus in corpora]
+        log = folder / "train.log"
+        droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
+        found = folder / "detector.onnx"
+        droguekit("detect", out / dataset, "--detector", found, "--out", boxes, log=log)
+    return boxes
+
+
+def cell_scores(dataset: Path, boxes: Path) -> dict[str, float]:
+    """AP50 in each cell of family and distance, in percent; empty frames of the family count in each of its cells."""
+    truth = read_detection_truth(dataset)
+    source = Dataset(dataset)
+    ids = frozenset(image_id_of(index, eye) for index in source.frame_indices for eye in EYES)
+    evaluation = Evaluation(truth.images, read_detections(boxes, ids))
+    where: dict[int, tuple[str, float | None]] = {
+        record.frame_index: (record.conditions.family, record.conditions.distance_m) for record in source.records()
+    }
+    scores = {}
+    for family in _FAMILIES:
+        for low_m, high_m in pairwise(EDGES_M):
+            inside: list[ImageTruth] = []
+            for image in truth.images:
+                own, distance_m = where[image.frame_index]
+                if own == family and (distance_m is None or low_m <= distance_m < high_m):
+                    inside.append(image)
+            ap50 = evaluation.average_precision(inside).ap50
+            if ap50 is not None:
+                scores[f"{family}, {low_m:g} to {high_m:g} m"] = 100.0 * ap50
+    return scores
+
+
+def table(scores: dict[str, list[dict[str, float]]], whole: dict[str, list[float]]) -> list[str]:
+    """Means over seeds by cell, the worst cell of the even arm first, and the gain there with its interval."""
+    cells = list(scores["even"][0])
+    mean = {arm: {cell: float(np.mean([each[cell] for each in scores[arm]])) for cell in cells} for arm in ARMS}
+    cells.sort(key=lambda cell: mean["even"][cell])
+    worst = cells[0]
+    lines = ["| cell | even, AP50 by seed | mined, AP50 by seed | gain |", "|---|---|---|---|"]
+    for cell in cells:
+        by_seed = {arm: ", ".join(f"{each[cell]:.1f}" for each in scores[arm]) for arm in ARMS}
+        gain = mean["mined"][cell] - mean["even"][cell]
+        lines.append(f"| {cell} | {by_seed['even']} | {by_seed['mined']} | {gain:+.1f} |")
+    by_seed = {arm: ", ".join(f"{value:.1f}" for value in whole[arm]) for arm in ARMS}
+    gain = float(np.mean(whole["mined"]) - np.mean(whole["even"]))
+    lines.append(f"| all | {by_seed['even']} | {by_seed['mined']} | {gain:+.1f} |")
+    for what, arms in (
+        (f"the worst cell, {worst}", {arm: [each[worst] for each in scores[arm]] for arm in ARMS}),
+        ("each training's own worst cell", {arm: [min(each.values()) for each in scores[arm]] for arm in ARMS}),
+    ):
+        differences = np.subtract(arms["mined"], arms["even"])
+        lines.append(f"gain in {what}: {differences.mean():+.1f}{_interval(differences)}")
+    return lines
+
+
+def _interval(differences: np.ndarray) -> str:
+    if len(differences) not in _T_975:
+        return ""
+    half = _T_975[len(differences)] * differences.std(ddof=1) / np.sqrt(len(differences))
+    return f", 95 % interval {differences.mean() - half:+.1f} to {differences.mean() + half:+.1f}"
+
+
+def main(
+    out: Annotated[Path, typer.Option("--out", help="Folder; what is found there is not made again.")] = Path(
+        "out/mining-loop"
+    ),
+    image_passes: Annotated[int, typer.Option("--image-passes", min=1, help="Of each training.")] = 1000,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Trainings of each arm.")] = 3,
+    kept: Annotated[float, typer.Option("--kept", help="As of `droguekit mine`.")] = 0.3,
+    test_pairs: Annotated[int, typer.Option("--test-pairs", min=2, help="Pairs of the test set.")] = 600,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
+) -> None:
+    """Render, train, detect, mine, render what was asked for, train both ways, and print the table."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        make_corpora(out, test_pairs, workers)
+        trial = train_and_detect(out, "first", ["first"], "trial", image_passes, 0)
+        mined, log = out / "mined.toml", out / "mine.log"
+        droguekit("mine", out / "trial", "--detections", trial, "--kept", kept, "--count", 150, "--out", mined, log=log)
+        droguekit("render", mined, "--out", out / "mined", "--workers", workers, log=out / "render.log")
+        scores: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
+        whole: dict[str, list[float]] = {arm: [] for arm in ARMS}
+        truth = read_detection_truth(out / "test")
+        for seed in range(1, seeds + 1):
+            for arm in ARMS:
+                boxes = train_and_detect(out, arm, ["first", arm], "test", image_passes, seed)
+                scores[arm].append(cell_scores(out / "test", boxes))
+                ids = frozenset(image_id_of(image.frame_index, image.eye) for image in truth.images)
+                ap50 = Evaluation(truth.images, read_detections(boxes, ids)).average_precision(truth.images).ap50
+                whole[arm].append(100.0 * (ap50 or 0.0))
+        write_text_atomic(out / "scores.json", json.dumps({"cells": scores, "all": whole}, indent=1) + "\n")
+    except (ValueError, OSError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    typer.echo("\n".join(table(scores, whole)))
+
+
+if __name__ == "__main__":
+    typer.run(main)
