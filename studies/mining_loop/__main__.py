@@ -15,11 +15,9 @@ import numpy as np
 import typer
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.storage.reader import Dataset
 from droguekit.scoring.detection.detection_metrics import Evaluation
 from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
-from droguekit.scoring.results.detection_result import image_id_of, read_detections
-from geometry.stereo import EYES
+from droguekit.scoring.results.detection_result import DetectedBox, image_id_of, read_detections
 
 RECIPE = Path(__file__).with_name("loop.toml")
 ARMS = ("even", "mined")
@@ -80,24 +78,24 @@ def train_and_detect(out: Path, name: str, corpora: Sequence[str], dataset: str,
 def cell_scores(dataset: Path, boxes: Path) -> dict[str, float]:
     """AP50 in each cell of family and distance, in percent; empty frames of the family count in each of its cells."""
     truth = read_detection_truth(dataset)
-    source = Dataset(dataset)
-    ids = frozenset(image_id_of(index, eye) for index in source.frame_indices for eye in EYES)
-    evaluation = Evaluation(truth.images, read_detections(boxes, ids))
-    where: dict[int, tuple[str, float | None]] = {
-        record.frame_index: (record.conditions.family, record.conditions.distance_m) for record in source.records()
-    }
+    evaluation = Evaluation(truth.images, read_boxes(truth.images, boxes))
     scores = {}
     for family in _FAMILIES:
         for low_m, high_m in pairwise(EDGES_M):
-            inside: list[ImageTruth] = []
-            for image in truth.images:
-                own, distance_m = where[image.frame_index]
-                if own == family and (distance_m is None or low_m <= distance_m < high_m):
-                    inside.append(image)
+            inside = [
+                image
+                for image in truth.images
+                if image.family == family and (image.distance_m is None or low_m <= image.distance_m < high_m)
+            ]
             ap50 = evaluation.average_precision(inside).ap50
             if ap50 is not None:
                 scores[f"{family}, {low_m:g} to {high_m:g} m"] = 100.0 * ap50
     return scores
+
+
+def read_boxes(images: Sequence[ImageTruth], boxes: Path) -> list[DetectedBox]:
+    """Boxes of a file, in images of which the truth is known."""
+    return read_detections(boxes, frozenset(image_id_of(image.frame_index, image.eye) for image in images))
 
 
 def table(scores: dict[str, list[dict[str, float]]], whole: dict[str, list[float]]) -> list[str]:
@@ -155,8 +153,8 @@ def main(
             for arm in ARMS:
                 boxes = train_and_detect(out, arm, ["first", arm], "test", image_passes, seed)
                 scores[arm].append(cell_scores(out / "test", boxes))
-                ids = frozenset(image_id_of(image.frame_index, image.eye) for image in truth.images)
-                ap50 = Evaluation(truth.images, read_detections(boxes, ids)).average_precision(truth.images).ap50
+                evaluation = Evaluation(truth.images, read_boxes(truth.images, boxes))
+                ap50 = evaluation.average_precision(truth.images).ap50
                 whole[arm].append(100.0 * (ap50 or 0.0))
         write_text_atomic(out / "scores.json", json.dumps({"cells": scores, "all": whole}, indent=1) + "\n")
     except (ValueError, OSError) as error:
