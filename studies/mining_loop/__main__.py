@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -145,6 +146,9 @@ def main(
         trial = train_and_detect(out, "first", ["first"], "trial", image_passes, 0)
         mined, log = out / "mined.toml", out / "mine.log"
         droguekit("mine", out / "trial", "--detections", trial, "--kept", kept, "--count", 150, "--out", mined, log=log)
+        # As many scenes as the even corpus has: scenes teach more than pairs of one scene.
+        asked = re.sub(r"(?m)^scenes = \d+", "scenes = 75", mined.read_text(encoding="utf-8"))
+        write_text_atomic(mined, asked)
         droguekit("render", mined, "--out", out / "mined", "--workers", workers, log=out / "render.log")
         scores: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
         whole: dict[str, list[float]] = {arm: [] for arm in ARMS}
