@@ -61,14 +61,18 @@ def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
         droguekit("render", recipe, "--out", out / name, "--workers", workers, log=out / "render.log")
 
 
-def train_and_detect(out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int) -> Path:
-    """Train on corpora unless that is done, and write the boxes in a dataset."""
+def train_and_detect(
+    out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int, start: Path | None = None
+) -> Path:
+    """Train on corpora unless that is done, from given weights or from the start, and write the boxes in a dataset."""
     folder = out / "trainings" / f"{name}-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     boxes = folder / f"{dataset}.json"
     if not boxes.is_file():
         words = ("--variant", "s", "--image-passes", passes, "--size", "192x256", "--seed", seed, "--threads", 1)
         sources = [out / corpus for corpus in corpora]
+        if start is not None:
+            words = (*words, "--start-from", start)
         log = folder / "train.log"
         droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
         found = folder / "detector.onnx"
@@ -135,6 +139,9 @@ def main(
     ),
     image_passes: Annotated[int, typer.Option("--image-passes", min=1, help="Of each training.")] = 1000,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Trainings of each arm.")] = 3,
+    further_passes: Annotated[
+        int | None, typer.Option("--further-passes", min=1, help="Train the first network on by so many, both ways.")
+    ] = None,
     kept: Annotated[float, typer.Option("--kept", help="As of `droguekit mine`.")] = 0.3,
     test_pairs: Annotated[int, typer.Option("--test-pairs", min=2, help="Pairs of the test set.")] = 600,
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
@@ -155,7 +162,11 @@ def main(
         truth = read_detection_truth(out / "test")
         for seed in range(1, seeds + 1):
             for arm in ARMS:
-                boxes = train_and_detect(out, arm, ["first", arm], "test", image_passes, seed)
+                name, passes, start = arm, image_passes, None
+                if further_passes is not None:
+                    name, passes = f"{arm}-further", further_passes
+                    start = trial.with_name("best.pt")
+                boxes = train_and_detect(out, name, ["first", arm], "test", passes, seed, start)
                 scores[arm].append(cell_scores(out / "test", boxes))
                 evaluation = Evaluation(truth.images, read_boxes(truth.images, boxes))
                 ap50 = evaluation.average_precision(truth.images).ap50
