@@ -19,6 +19,7 @@ from datasets_manifest.atomic import write_text_atomic
 from droguekit.scoring.detection.detection_metrics import Evaluation
 from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
 from droguekit.scoring.results.detection_result import DetectedBox, image_id_of, read_detections
+from geometry.se3 import Array
 
 RECIPE = Path(__file__).with_name("loop.toml")
 ARMS = ("even", "mined")
@@ -69,10 +70,11 @@ def train_and_detect(
     folder.mkdir(parents=True, exist_ok=True)
     boxes = folder / f"{dataset}.json"
     if not boxes.is_file():
-        words = ("--variant", "s", "--image-passes", passes, "--size", "192x256", "--seed", seed, "--threads", 1)
+        words: list[object] = ["--variant", "s", "--image-passes", passes, "--size", "192x256", "--seed", seed]
+        words += ["--threads", 1]
         sources = [out / corpus for corpus in corpora]
         if start is not None:
-            words = (*words, "--start-from", start)
+            words += ["--start-from", start]
         log = folder / "train.log"
         droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
         found = folder / "detector.onnx"
@@ -126,7 +128,7 @@ def table(scores: dict[str, list[dict[str, float]]], whole: dict[str, list[float
     return lines
 
 
-def _interval(differences: np.ndarray) -> str:
+def _interval(differences: Array) -> str:
     if len(differences) not in _T_975:
         return ""
     half = _T_975[len(differences)] * differences.std(ddof=1) / np.sqrt(len(differences))
