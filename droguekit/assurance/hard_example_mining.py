@@ -29,6 +29,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.untrusted_files import read_text
 from droguekit.assurance.solved_cases import solved_cases
 from droguekit.batch.progress import ProgressReport
 from scenes.framing import distance_at
@@ -208,7 +209,7 @@ def _recipe_of(source: Dataset, given: Path | None) -> tuple[str, Recipe]:
     if old.sequence is not None or old.frames.in_turn:
         raise ValueError(f"{source.path}: recipe: mining weights drawn frames, and this recipe has its own order")
     try:
-        text = given.read_text(encoding="utf-8") if given else open_storage(source.path).read(RECIPE_FILE).decode()
+        text = read_text(given) if given else open_storage(source.path).read(RECIPE_FILE).decode()
     except OSError as error:
         raise ValueError(f"{given or source.path}: the recipe cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -252,13 +253,13 @@ def _change_laws(
         yield law
     if old.distance.low_m is not None and old.distance.low_m != old.distance.high_m:
         edges_m, shares = _distance_bins(old.distance, choices.distance_bins)
-        names = [f"{low:.3g} to {high:.3g} m" for low, high in pairwise(edges_m)]
+        names = _bin_names(edges_m)
 
         def bin_of(family: str, drogue: str, distance_m: float | None) -> str:
             return names[min(max(int(np.searchsorted(edges_m, distance_m or 0.0, "right")) - 1, 0), len(names) - 1)]
 
         law = _mined("distance", dict(zip(names, shares, strict=True)), *tally(bin_of), kept)
-        table["distance"]["edges_m"] = [float(f"{edge:.12g}") for edge in edges_m]
+        table["distance"]["edges_m"] = edges_m
         table["distance"]["weights"] = [round(place.after * len(names), _DIGITS) for place in law.bins]
         yield law
     failures, counts = tally(lambda family, drogue, distance_m: drogue)
@@ -285,8 +286,17 @@ def _distance_bins(law: DistanceLaw, count: int) -> tuple[list[float], list[floa
     if law.edges_m is not None and law.weights is not None:
         total = sum(law.weights)
         return list(law.edges_m), [weight / total for weight in law.weights]
-    inner = sorted(distance_at(law, place / count) for place in range(1, count))
+    inner = sorted(float(f"{distance_at(law, place / count):.12g}") for place in range(1, count))
     return [float(law.low_m or 0.0), *inner, float(law.high_m or 0.0)], [1.0 / count] * count
+
+
+def _bin_names(edges_m: Sequence[float]) -> list[str]:
+    """A name for each bin, with as many digits as tell all edges apart."""
+    for digits in range(3, 18):
+        texts = [f"{edge:.{digits}g}" for edge in edges_m]
+        if len(set(texts)) == len(texts):
+            break
+    return [f"{low} to {high} m" for low, high in pairwise(texts)]
 
 
 def _mined(

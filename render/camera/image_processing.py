@@ -42,9 +42,10 @@ def develop(raw: NDArray[np.uint16], frame: FrameSpec, processing: ImageProcessi
     noise = noise_by_level(frame, processing)
     faint: Plane = np.square(np.maximum(processing.denoise_threshold * noise, 1e-3), dtype=np.float32)
     # The darker it was, the wider processors average.
-    wider = 1.0 + min(float(noise[round(float(tables[1][raw].mean()))]) / _NOISE_DOUBLING, _MOST_WIDENING)
+    levels = tables[1][raw]
+    wider = 1.0 + min(float(noise[round(float(levels.mean()))]) / _NOISE_DOUBLING, _MOST_WIDENING)
     if frame.is_monochrome:
-        luma = tables[1][raw]
+        luma = levels
         grey = np.empty(raw.shape, np.uint8)
         _finish_grey(luma, _blurred(luma, wider * processing.denoise_sigma_px), detail, faint, grey)
         return grey

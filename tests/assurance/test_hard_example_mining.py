@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,19 +56,19 @@ def is_hard(record: PairRecord) -> bool:
     return distance_m is not None and distance_m > 8.0 and record.conditions.family == "low-sun"
 
 
-def write_failures(dataset: Path, out: Path, method: str = "planted") -> Path:
+def write_failures(dataset: Path, out: Path, hard: Callable[[PairRecord], bool] = is_hard) -> Path:
     source = Dataset(dataset)
     answers: list[PoseEstimate | NoFix] = []
     for record in source.records():
         pose = record.left_from_drogue
         if pose is None:
             continue
-        moved = RigidTransform(pose.rotation, pose.translation_m * (1.1 if is_hard(record) else 1.001))
+        moved = RigidTransform(pose.rotation, pose.translation_m * (1.1 if hard(record) else 1.001))
         answers.append(
             PoseEstimate(
                 frame_index=record.frame_index,
                 time_s=record.frame.time_s,
-                method=method,
+                method="planted",
                 left_from_drogue=moved,
                 covariance=np.eye(6) * 1e-4,
                 modes=(),
@@ -133,6 +134,22 @@ def test_keeping_everything_keeps_the_laws_and_mining_again_goes_on(dataset: Pat
     written = tomllib.loads(first.text)["distance"]
     assert len(law.bins) == 4
     np.testing.assert_allclose([place.before for place in law.bins], np.array(written["weights"]) / 4, atol=1e-4)
+
+
+def test_bins_of_a_narrow_range_stay_apart(tmp_path: Path) -> None:
+    """Three digits name all edges from 8 to 8.005 m alike."""
+    narrow = text_of(
+        distance=between(8.0, 8.005), frames={"count": 12, "scenes": 6, "empty_fraction": 0.0}, families=[]
+    )
+    dataset = rendered(narrow, tmp_path / "narrow")
+    poses = tmp_path / "poses.jsonl"
+    write_failures(dataset, poses, hard=lambda record: record.frame_index % 2 == 0)
+    mined = mine_recipe(dataset, "harder", MiningChoices(distance_bins=8), poses)
+    (law,) = (law for law in mined.laws if law.of == "distance")
+    assert len({place.name for place in law.bins}) == len(law.bins) == 8
+    recipe = parse_recipe(mined.text)
+    assert recipe.distance.weights is not None and len(recipe.distance.weights) == 8
+    assert sum(place.cases for place in law.bins) == 12
 
 
 def test_the_command_writes_a_recipe_and_tells_the_shares(
