@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import cv2
@@ -235,6 +235,12 @@ class GroundView:
     across_m: Field
     along_m: Field
     places: int
+
+    def scaled(self, factor: float) -> GroundView:
+        """The same pieces in a unit of length that is `factor` times shorter, for textures that repeat sooner."""
+        by = np.float32(factor)
+        x_m, y_m, across_m, along_m = (by * part for part in (self.x_m, self.y_m, self.across_m, self.along_m))
+        return replace(self, x_m=x_m, y_m=y_m, across_m=across_m, along_m=along_m)
 
     def average(self, *tiles: MipTile, axes: Axes | None = None) -> list[Field]:
         """Means of ground textures over each piece.

@@ -152,11 +152,9 @@ def _window_marks(window: Window, eye: Eye, width_px: int, height_px: int) -> tu
     if window.drops:
         dark, bright = np.zeros_like(lost), np.zeros_like(lost)
         for _ in range(window.drops):
-            radius = unit * rng.uniform(2.0, 9.0)
-            at = _draw_spot(dark, rng, radius, 1.0)
-            cv2.circle(bright, _pixel(at - (0.0, 0.4 * radius)), max(round(0.5 * radius), 1), 1.0, -1)
-        lost += 0.35 * cv2.GaussianBlur(dark, (0, 0), 1.8 * unit)
-        added += 0.3 * cv2.GaussianBlur(bright, (0, 0), 2.0 * unit)
+            _draw_drop(dark, bright, rng, unit)
+        lost += cv2.GaussianBlur(dark, (0, 0), 1.8 * unit)
+        added += cv2.GaussianBlur(bright, (0, 0), 2.0 * unit)
     if window.reflection_fraction:
         shapes = np.zeros_like(lost)
         for _ in range(int(rng.integers(2, 6))):
@@ -165,6 +163,22 @@ def _window_marks(window: Window, eye: Eye, width_px: int, height_px: int) -> tu
             cv2.rectangle(shapes, _pixel(corner), _pixel(opposite), float(rng.random()), -1)
         added += window.reflection_fraction * cv2.GaussianBlur(shapes, (0, 0), 10.0 * unit)
     return (1.0 - np.minimum(lost, 0.9)).astype(np.float32), added.astype(np.float32)
+
+
+def _draw_drop(dark: Light, bright: Light, rng: np.random.Generator, unit: float) -> None:
+    """Draw a few drops grown together, dark above and bright below, for they show the view upside down."""
+    at = rng.random(2) * (dark.shape[1], dark.shape[0])
+    radius = unit * float(np.clip(np.exp(rng.normal(1.1, 0.6)), 1.0, 12.0))
+    strength = rng.uniform(0.1, 0.45)
+    for part in range(int(rng.integers(1, 4))):
+        size = radius * (rng.uniform(0.75, 1.25, 2) if part == 0 else rng.uniform(0.3, 0.8, 2))
+        # Drops run down the glass and leave their tails above.
+        place = at if part == 0 else at + radius * rng.normal((0.0, -0.4), (0.5, 0.8))
+        turn_deg = rng.uniform(-25.0, 25.0)
+        for layer, level, down in ((dark, strength, -0.2), (bright, 0.8 * strength, 0.45)):
+            center = place + np.array([0.0, down * size[1]])
+            axes = np.maximum(np.rint(size * (1.0 if layer is dark else 0.6)), 1.0)
+            cv2.ellipse(layer, _pixel(center), _pixel(axes), turn_deg, 0.0, 360.0, level, -1)
 
 
 def _draw_spot(layer: Light, rng: np.random.Generator, radius: float, level: float) -> NDArray[np.float64]:

@@ -79,7 +79,11 @@ class Ground:
         self._shift_m = rng.uniform(0, 1e5, 2).astype(np.float32)
         self._cover = LandCover(environment, rng, light.beam_direction)
         wind_rad = float(rng.uniform(-np.pi, np.pi))
-        self._sea = Sea(light, environment.wind_speed_m_s, wind_rad) if self._kind in ("sea", "coast") else None
+        swell_rad, swell = frame_generator(environment.ground_texture_seed, 0, "swell").uniform(
+            (-np.pi, 0.0), (np.pi, 1.0)
+        )
+        is_wet = self._kind in ("sea", "coast")
+        self._sea = Sea(light, environment.wind_speed_m_s, wind_rad, swell_rad, swell) if is_wet else None
         self._coast = Coast(rng, environment.altitude_m) if self._kind == "coast" else None
         self._ships = sample_ships(rng, environment.altitude_m) if self._kind == "sea" else ()
         self._airfield = Airfield(rng) if self._kind == "airfield" else None

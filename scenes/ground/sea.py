@@ -24,12 +24,21 @@ _WATER_INDEX = 1.34
 _SEED = 5
 _TILE_PX, _TILE_TEXEL_M = 1024, 2.0
 _LONGEST_WAVE_M, _SHORTEST_WAVE_M = 130.0, 4.0
+# Waves of weaker winds are shorter, but a tile that is made too small repeats in view.
+_LEAST_PEAK_M = 20.0
+# Of the resolved variance, waves that run across the others, so that no two places of a large sea are alike.
+_CROSS_SHARE, _CROSS_SCALE, _CROSS_RAD = 0.3, 0.61, 0.5
 # Slope variance is even over the octaves from gravity waves to ripples; the longest 4 of about 13 are resolved.
 _RESOLVED_SHARE = 0.3
+# Swell of 0.5 to 2 m height between crest and trough, from winds far away.
+_SWELL_TILE_PX, _SWELL_TEXEL_M, _SWELL_LENGTH_M = 512, 12.0, 170.0
+_SWELL_SLOPES = 0.006, 0.022
 _GUSTINESS = 0.3  # standard deviation of the slopes' variance over patches of wind, our choice
 _FOAM_REFLECTANCE = 0.35  # fresh and fading foam, Koepke 1984 (doi:10.1364/AO.23.001816)
 _FOAM_PATCHES = 0.01  # share of the tile under foam patches
 _TABLE_ROWS, _TABLE_COLUMNS = 20, 36
+# Factors on the variance of the slopes for which the mirrored sky is tabulated.
+_SMOOTH, _ROUGH = 0.4, 1.9
 _SKY_ROWS, _SKY_COLUMNS = 24, 72
 _HULLS: tuple[ReflectanceRgb, ...] = ((0.38, 0.05, 0.04), (0.22, 0.05, 0.035), (0.05, 0.07, 0.12), (0.10, 0.10, 0.10))
 _HOUSE: ReflectanceRgb = (0.55, 0.55, 0.53)
@@ -72,6 +81,14 @@ def slope_variances(wind_speed_m_s: float) -> tuple[float, float]:
 def foam_fraction(wind_speed_m_s: float) -> float:
     """Share of the sea under whitecaps. Source: Monahan and O'Muircheartaigh 1980, W = 3.84e-6 U^3.41."""
     return float(3.84e-6 * wind_speed_m_s**3.41)
+
+
+def longest_wave_m(wind_speed_m_s: float) -> float:
+    """Length of the waves with most energy in a sea that the wind has long blown over. [m]
+
+    Source: Pierson and Moskowitz 1964 (doi:10.1029/JZ069i024p05181), whose peak is at 0.877 g / U.
+    """
+    return 2 * np.pi * wind_speed_m_s**2 / (0.877**2 * 9.81)
 
 
 def fresnel(cosine: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
@@ -119,6 +136,20 @@ def _wave_tile() -> MipTile:
 
 
 @lru_cache(maxsize=1)
+def _swell_tile() -> MipTile:
+    """Slopes of unit variance along the way of a swell: waves of nearly one length and direction, in groups."""
+    rng = frame_generator(_SEED, 0, "swell")
+    size = (_SWELL_TILE_PX, _SWELL_TILE_PX)
+    down, across = np.meshgrid(
+        np.fft.fftfreq(_SWELL_TILE_PX, _SWELL_TEXEL_M), np.fft.rfftfreq(_SWELL_TILE_PX, _SWELL_TEXEL_M), indexing="ij"
+    )
+    length, turn = np.hypot(down, across) * _SWELL_LENGTH_M, np.arctan2(down, np.maximum(across, 1e-12))
+    amplitude = np.exp(-(((length - 1.0) / 0.16) ** 2) - (turn / 0.2) ** 2)
+    slopes = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(size)) * amplitude, s=size)
+    return MipTile((slopes / slopes.std())[..., None].astype(np.float32), _SWELL_TEXEL_M)
+
+
+@lru_cache(maxsize=1)
 def _gust_tile() -> MipTile:
     """Cat's paws and slicks between 20 m and 2 km, of unit variance."""
     return MipTile(power_noise(_SEED, "gusts", 512, 1.5, 5.0)[..., None], 8.0)
@@ -131,14 +162,21 @@ class Sea:
         light: on the sea.
         wind_speed_m_s: at 12.5 m above the sea. [m/s]
         wind_rad: direction to which the wind blows, from east towards north. [rad]
+        swell_rad: direction to which the swell runs, likewise. [rad]
+        swell: slope of the swell, from 0 for the least to 1 for the most.
     """
 
-    def __init__(self, light: GroundLight, wind_speed_m_s: float, wind_rad: float) -> None:
+    def __init__(
+        self, light: GroundLight, wind_speed_m_s: float, wind_rad: float, swell_rad: float = 0.0, swell: float = 0.0
+    ) -> None:
         self._light = light
         self._along, self._across = slope_variances(wind_speed_m_s)
         self._foam = foam_fraction(wind_speed_m_s)
+        self._wind_rad, self._swell_rad = wind_rad, swell_rad
         self._wind = np.float32(np.cos(wind_rad)), np.float32(np.sin(wind_rad))
-        self._table = self._sky_table()
+        self._scale = _LONGEST_WAVE_M / max(longest_wave_m(wind_speed_m_s), _LEAST_PEAK_M)
+        self._swell_slope = _SWELL_SLOPES[0] + swell * (_SWELL_SLOPES[1] - _SWELL_SLOPES[0])
+        self._smooth, self._rough = self._sky_table(_SMOOTH), self._sky_table(_ROUGH)
 
     def radiance(self, view: GroundView, body_rgb: Field, gusts: Field) -> Radiance:
         """(H, W, 3) radiance of the water. [cd/m2]
@@ -149,34 +187,62 @@ class Sea:
             gusts: (H, W) factor on the variance of the slopes.
         """
         cosine, sine = self._wind
-        ones, zeros = np.ones_like(view.x_m), np.zeros_like(view.x_m)
-        waves = view.average(_wave_tile(), axes=Axes(cosine, sine, ones, zeros, zeros))[0]
         # Patches of wind are drawn out along it.
         u, v = cosine * view.x_m + sine * view.y_m, cosine * view.y_m - sine * view.x_m
         width_m = np.sqrt(view.across_m * view.along_m)
         paws = _gust_tile().sample(np.float32(0.4) * u, v, width_m)[..., 0]
         gusts = gusts * np.clip(1.0 + np.float32(_GUSTINESS) * paws, 0.25, 2.2)
+        slope_x, slope_y, patches = self._waves(view)
         size = np.float32(np.sqrt(_RESOLVED_SHARE * (self._along + self._across))) * np.sqrt(gusts)
-        slope_x = size * (cosine * waves[..., 0] - sine * waves[..., 1])
-        slope_y = size * (sine * waves[..., 0] + cosine * waves[..., 1])
+        slope_x, slope_y = self._with_swell(view, size * slope_x, size * slope_y)
         towards = slope_x * view.away_x + slope_y * view.away_y
-        mirrored = self._mirrored_sky(view, towards)
+        mirrored = self._mirrored_sky(view, towards, gusts)
         mirrored += self._glint(view, slope_x, slope_y, gusts)
         level = (self._light.level_lux / np.pi).astype(np.float32)
-        foam = np.minimum(waves[..., 2] * gusts * np.float32(self._foam / _FOAM_PATCHES), 1.0)[..., None]
+        foam = np.minimum(patches * gusts * np.float32(self._foam / _FOAM_PATCHES), 1.0)[..., None]
         water = mirrored + np.asarray(body_rgb, dtype=np.float32) * level
         result: Radiance = water + foam * (np.float32(_FOAM_REFLECTANCE) * level - water)
         return result
 
-    def _mirrored_sky(self, view: GroundView, towards: Field) -> Radiance:
-        """Sky mirrored in waves that a resolved slope tilts towards the camera; the table holds the finer waves."""
+    def _waves(self, view: GroundView) -> tuple[Field, Field, Field]:
+        """(H, W) slopes east and north, together of unit variance where nothing is averaged out, and foam patches."""
+        ones, zeros = np.ones_like(view.x_m), np.zeros_like(view.x_m)
+        parts = []
+        for turn_rad, scale in ((0.0, self._scale), (_CROSS_RAD, _CROSS_SCALE * self._scale)):
+            angle_rad = self._wind_rad + turn_rad
+            cosine, sine = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
+            waves = view.scaled(scale).average(_wave_tile(), axes=Axes(cosine, sine, ones, zeros, zeros))[0]
+            along, across = waves[..., 0], waves[..., 1]
+            parts.append((cosine * along - sine * across, sine * along + cosine * across, waves[..., 2]))
+        first, second = np.float32(np.sqrt(1.0 - _CROSS_SHARE)), np.float32(np.sqrt(_CROSS_SHARE))
+        (x, y, foam), (cross_x, cross_y, _) = parts
+        return first * x + second * cross_x, first * y + second * cross_y, foam
+
+    def _with_swell(self, view: GroundView, slope_x: Field, slope_y: Field) -> tuple[Field, Field]:
+        """(H, W) slopes east and north with those of the swell."""
+        ones, zeros = np.ones_like(view.x_m), np.zeros_like(view.x_m)
+        cosine, sine = np.float32(np.cos(self._swell_rad)), np.float32(np.sin(self._swell_rad))
+        swell = view.average(_swell_tile(), axes=Axes(cosine, sine, ones, zeros, zeros))[0][..., 0]
+        swell *= np.float32(self._swell_slope)
+        return slope_x + cosine * swell, slope_y + sine * swell
+
+    def _mirrored_sky(self, view: GroundView, towards: Field, gusts: Field) -> Radiance:
+        """Sky mirrored in waves that a resolved slope tilts towards the camera; the tables hold the finer waves."""
         elevation = np.arcsin(np.clip(view.sine, 0.0, 1.0)) + towards
         row = _row_of_elevation(np.clip(elevation, 0.0, np.pi / 2)).astype(np.float32)
         azimuth = np.arctan2(view.away_y, view.away_x)
         column = np.mod(azimuth * np.float32(_TABLE_COLUMNS / (2 * np.pi)), np.float32(_TABLE_COLUMNS))
+        shape = view.x_m.shape
         # One column is repeated at the end, because remap would wrap rows as well as columns.
-        seen = sample_bilinear(self._table, column, row, cv2.BORDER_REPLICATE)
-        return np.asarray(seen, dtype=np.float32).reshape(*view.x_m.shape, 3)
+        smooth, rough = (
+            np.asarray(sample_bilinear(table, column, row, cv2.BORDER_REPLICATE), np.float32).reshape(*shape, 3)
+            for table in (self._smooth, self._rough)
+        )
+        # Between the tables what is mirrored goes about as the logarithm of the variance.
+        share = np.log(np.maximum(gusts, np.float32(1e-2)) / np.float32(_SMOOTH)) / np.float32(np.log(_ROUGH / _SMOOTH))
+        share = np.clip(share, -0.5, 1.5)[..., None]
+        result: Radiance = smooth + share * (rough - smooth)
+        return result
 
     def _glint(self, view: GroundView, slope_x: Field, slope_y: Field, gusts: Field) -> Radiance:
         """Glint of sun or moon: the share of the surface with the slope that mirrors it into the camera.
@@ -204,8 +270,12 @@ class Sea:
         result: Radiance = share.astype(np.float32)[..., None] * self._light.beam_lux.astype(np.float32)
         return result
 
-    def _sky_table(self) -> Radiance:
-        """(rows, columns + 1, 3) mirrored sky by elevation of the camera over the water and azimuth of the ray."""
+    def _sky_table(self, roughness: float) -> Radiance:
+        """(rows, columns + 1, 3) mirrored sky by elevation of the camera over the water and azimuth of the ray.
+
+        Args:
+            roughness: factor on the variance of the slopes.
+        """
         elevation = _elevation_of_row(np.arange(_TABLE_ROWS))
         azimuth = np.arange(_TABLE_COLUMNS + 1) * 2 * np.pi / _TABLE_COLUMNS
         e, a = np.meshgrid(elevation, azimuth, indexing="ij")
@@ -215,7 +285,7 @@ class Sea:
         cosine, sine = self._wind
         steps = np.linspace(-2.5, 2.5, 9)
         for s, t in np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2):
-            along, across = s * np.sqrt(self._along), t * np.sqrt(self._across)
+            along, across = s * np.sqrt(roughness * self._along), t * np.sqrt(roughness * self._across)
             normal = np.array([-(cosine * along - sine * across), -(sine * along + cosine * across), 1.0])
             normal /= np.linalg.norm(normal)
             facing = np.maximum(back @ normal, 0.0)

@@ -8,8 +8,8 @@ import pytest
 from datasets_manifest.types.environment import GROUND_KINDS, Environment
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.land_tiles import land_textures
-from scenes.ground.sea import GroundLight, Sea, fresnel, slope_variances
-from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad, power_noise
+from scenes.ground.sea import GroundLight, Sea, fresnel, longest_wave_m, slope_variances
+from scenes.ground_view import FARTHEST_M, GroundView, MipTile, ground_view, pixel_angle_rad, power_noise
 from scenes.sky.photometry import luminance
 
 
@@ -133,6 +133,54 @@ def test_slopes_are_those_of_cox_and_munk() -> None:
     """Total mean square slope 0.003 + 0.00512 U (their equation for clean seas), within the fit's own 0.004."""
     for wind in (2.0, 7.0, 14.0):
         assert sum(slope_variances(wind)) == pytest.approx(0.003 + 0.00512 * wind, abs=0.004)
+
+
+def test_waves_grow_with_the_wind() -> None:
+    """A fully grown sea under 10 m/s has its peak at a period of 7.3 s, which deep water gives 83 m."""
+    assert longest_wave_m(10.0) == pytest.approx(9.81 / (2 * np.pi) * (2 * np.pi * 10.0 / (0.877 * 9.81)) ** 2)
+    assert longest_wave_m(10.0) == pytest.approx(83.0, abs=1.0)
+    lengths = []
+    for wind in (5.0, 10.0):
+        sea = Sea(light(), wind, 0.0)
+        x_m = np.arange(4096, dtype=np.float32)[None] * np.float32(0.5)
+        straight = np.ones_like(x_m)
+        view = GroundView(x_m, 0 * x_m + 100.0, straight, 0 * x_m, straight, straight / 2, straight / 2, 1)
+        slope = sea._waves(view)[0][0]
+        heights = np.fft.rfft(slope * np.hanning(slope.size))[1:] / np.arange(1, slope.size // 2 + 1)
+        power = np.abs(heights) ** 2
+        lengths.append(2048.0 / float((power * np.arange(1, power.size + 1)).sum() / power.sum()))
+    assert 2.5 < lengths[1] / lengths[0] < 6.0  # four, as the square of the wind, within one line's chance
+
+
+def test_patches_of_wind_are_darker_or_brighter_by_their_slopes() -> None:
+    """Under a sky that is bright at the horizon rough water mirrors its darker upper part, as another table says."""
+    lit = GroundLight(
+        np.full(3, 6000.0),
+        np.array([0.0, 0.0, 1.0]),
+        np.zeros(3),
+        lambda directions: np.repeat(4000.0 - 3000.0 * np.abs(directions[..., 2:]), 3, axis=-1).astype(np.float32),
+    )
+    sea = Sea(lit, 7.0, 0.0)
+    view = ground_view(rays(10.0, 4.0), 3000.0, 1e-3)
+    still = np.zeros_like(view.x_m)
+    calm, mean, rough = (sea._mirrored_sky(view, still, still + np.float32(gust))[..., 0] for gust in (0.4, 1.0, 1.9))
+    assert calm.mean() > 1.1 * mean.mean() > 1.1 * 1.1 * rough.mean()
+    sea._smooth = sea._rough = sea._sky_table(1.0)
+    np.testing.assert_allclose(mean, sea._mirrored_sky(view, still, still + 1)[..., 0], rtol=0.03)
+
+
+def test_swell_runs_in_its_own_direction() -> None:
+    """Slopes along the crests of a swell are a small part of those along its way."""
+    sea = Sea(light(), 7.0, 0.0, swell_rad=0.9, swell=1.0)
+    place = np.arange(256, dtype=np.float32) * 20.0
+    x_m, y_m = np.meshgrid(place, place)
+    straight = np.ones_like(x_m)
+    view = GroundView(x_m, y_m, straight, 0 * x_m, straight, straight, straight, 1)
+    slope_x, slope_y = sea._with_swell(view, 0 * x_m, 0 * x_m)
+    np.testing.assert_allclose(slope_y, np.tan(0.9) * slope_x, rtol=1e-4, atol=1e-8)
+    assert float(np.hypot(slope_x, slope_y).std()) == pytest.approx(0.022 * 0.6, rel=0.15)  # their size is half-normal
+    across = np.roll(slope_x, -4, axis=0) - slope_x, np.roll(slope_x, -4, axis=1) - slope_x
+    assert across[0].std() > across[1].std()  # steps north cross more crests than steps east
 
 
 def test_a_calm_sea_mirrors_the_sky() -> None:
