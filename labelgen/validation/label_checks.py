@@ -17,25 +17,15 @@ from geometry.distortion import Lens
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.disc_images import DiscInEye, hub_discs, marker_discs
+from labelgen.label_errors import ARITHMETIC_PX, LATTICE_LIMIT_RMS, centroid_error
 from labelgen.part_pixels import FeaturePixels, drogue_mask, parts_mask
 from render.engine import EyeRadiance, StereoRadiance
-
-# Root mean square distance between the centroid of the pixel centres in a disc and the disc's own centre is this times
-# sqrt(a) / b for semi-axes a >= b in pixels: each of the boundary's 2 pi a pixels errs by a variance of 1/12 px^2 at a
-# lever of a / sqrt 2, over an area of pi a b: sqrt(2 a / (12 pi b^2)).
-LATTICE_RMS = float(np.sqrt(2.0 / (12.0 * np.pi)))
-
-# The largest of 1e5 simulated discs was 2.9 rms; unlike a normal error, this one is bounded.
-_LATTICE_LIMIT_RMS = 4.0
 
 # Meshes draw circles as polygons of 128 sides and the same area, whose corners stand out by (pi / 128)^2 / 6 = 1e-4.
 _OUTLINE_TOLERANCE = 5e-4
 
 # Rays, vertices and the product of a few transforms, each rounded to float32 at the scale of the distance.
 _DEPTH_ROUNDINGS = 32.0
-
-# Two projections in float64 agree far better; a wrong pixel convention exceeds it.
-_PROJECTION_TOLERANCE_PX = 1e-6
 
 # The rows of both eyes are computed from the same numbers.
 _EPIPOLAR_TOLERANCE_PX = 1e-9
@@ -120,24 +110,12 @@ def check_unoccluded_marker(
     if inside and part_id[row, column] != disc.part:
         faults.append(f"center_proj_px: pixel {column}, {row} sees part {part_id[row, column]}, not {disc.part}")
     error_px, rms_px = centroid_error(view, disc, pixels)
-    if np.hypot(*error_px) > _LATTICE_LIMIT_RMS * rms_px:
+    if np.hypot(*error_px) > LATTICE_LIMIT_RMS * rms_px:
         faults.append(
             f"center_ellipse_px: is {np.hypot(*error_px):.3f} px from the centroid of part {disc.part}, "
-            f"more than {_LATTICE_LIMIT_RMS * rms_px:.3f} px"
+            f"more than {LATTICE_LIMIT_RMS * rms_px:.3f} px"
         )
     return faults
-
-
-def centroid_error(view: FeatureView, disc: DiscInEye, pixels: FeaturePixels) -> tuple[Array, float]:
-    """Centroid of a marker's pixels less `center_ellipse_px`.
-
-    Returns:
-        (2,) error [px], and the root mean square length that the pixel lattice alone gives it [px].
-    """
-    longer, shorter = disc.semi_axes_px()
-    rows, columns = pixels.indices(disc.part)
-    error = np.array([columns.mean(), rows.mean()]) - np.array(view.center_ellipse_px)
-    return error, LATTICE_RMS * float(np.sqrt(longer)) / shorter
 
 
 def _check_drogue(
@@ -294,7 +272,7 @@ def _point_faults(
         offset = real_from_ideal @ (pose.translation_m - rig.eye_offset_m(eye))
         want, _ = cv2.projectPoints(points_m, turn, offset, lens.camera.matrix(), lens.distortion.coefficients())
         error = np.abs(labelled[eye] - want.reshape(-1, 2)).max(axis=1)
-        for index in np.flatnonzero(~(error <= _PROJECTION_TOLERANCE_PX)):
+        for index in np.flatnonzero(~(error <= ARITHMETIC_PX)):
             faults.append(f"{eye}: {names[index]}: is {error[index]:.3g} px off the pose's image")
         try:
             ideal[eye] = rig.ideal_px(labelled[eye], eye)

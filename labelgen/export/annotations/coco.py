@@ -36,6 +36,7 @@ from labelgen.export.keypoints import (
     view_keypoints,
     view_of,
 )
+from labelgen.label_errors import confirmed_px, label_errors
 
 DROGUE, MARKER, HUB = 1, 2, 3
 """Ids of the categories."""
@@ -320,6 +321,7 @@ def coco_annotation(
         "num_keypoints": sum(point.flag > 0 for point in points),
         NAMESPACE: {
             "bbox_full": _corner_box(view.box_full_xywh_px),
+            **_error_limits(record, eye),
             "truncated": view.truncated,
             **({"sought": True} if record.frame.neighbours else {}),
             "drogue": drogue.name,
@@ -333,6 +335,17 @@ def coco_annotation(
             "roll_deg": record.roll_deg,
             "roll_modulo_deg": record.roll_modulo_deg,
         },
+    }
+
+
+def _error_limits(record: PairRecord, eye: Eye) -> dict[str, Any]:
+    """Limits on the errors of both boxes' sides and of the markers' centres, by key."""
+    limits = label_errors(record, eye)
+    assert limits is not None
+    return {
+        "bbox_error_px": list(limits.box_visible_px),
+        "bbox_full_error_px": list(limits.box_full_px),
+        "center_error_px": list(limits.markers_px),
     }
 
 
@@ -419,6 +432,8 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
     if view.box_visible_xywh_px is None:
         return []
     image_id, entries = _small_image_id(record, eye), []
+    limits, confirmed = label_errors(record, eye), confirmed_px(record, eye, part_id)
+    assert limits is not None
     for seen in drogue_pixels(record, eye, part_id).features(view):
         feature, index = seen.feature, seen.marker_index
         entries.append(
@@ -437,6 +452,8 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
                     "marker_index": index,
                     "center_proj": _corner_point(feature.center_proj_px),
                     "center_ellipse": _corner_point(feature.center_ellipse_px),
+                    "center_error_px": limits.hub_px if index is None else limits.markers_px[index],
+                    **({} if index is None else {"center_confirmed_px": confirmed[index]}),
                     "visible_fraction": feature.visible_fraction,
                     "in_image": feature.in_image,
                     "signal_to_noise": feature.signal_to_noise,

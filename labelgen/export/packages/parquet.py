@@ -24,6 +24,7 @@ from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.coco import coco_image_id
 from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import view_of
+from labelgen.label_errors import label_errors
 
 TABLE_FILE = "views.parquet"
 _ROWS_AT_ONCE = 2048
@@ -46,6 +47,8 @@ _FEATURE_NUMBERS = (
     *("center_proj_u_px", "center_proj_v_px", "center_ellipse_u_px", "center_ellipse_v_px"),
     *("visible_fraction", "signal_to_noise"),
 )
+
+_ERROR_LISTS = ("marker_center_error_px", "box_full_error_px", "box_visible_error_px")
 
 
 def write_parquet(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
@@ -127,7 +130,17 @@ def view_row(record: PairRecord, eye: Eye, split: str) -> dict[str, Any]:
         **_marker_columns(view.markers),
         **({} if view.hub is None else {f"hub_{name}": number for name, number in _feature_numbers(view.hub).items()}),
         "hub_in_image": None if view.hub is None else view.hub.in_image,
+        **_error_columns(record, eye),
     }
+
+
+def _error_columns(record: PairRecord, eye: Eye) -> dict[str, Any]:
+    """Limits on the errors of labels: of centres, and of the left, upper, right and lower sides of boxes."""
+    limits = label_errors(record, eye)
+    if limits is None:
+        return {}
+    lists = (limits.markers_px, limits.box_full_px, limits.box_visible_px)
+    return {**dict(zip(_ERROR_LISTS, map(list, lists), strict=True)), "hub_center_error_px": limits.hub_px}
 
 
 def _schema(manifest: Manifest) -> pa.Schema:
@@ -142,6 +155,8 @@ def _schema(manifest: Manifest) -> pa.Schema:
         ("marker_in_image", pa.list_(pa.bool_())),
         *((f"hub_{name}", pa.float64()) for name in _FEATURE_NUMBERS),
         ("hub_in_image", pa.bool_()),
+        *((name, pa.list_(pa.float64())) for name in _ERROR_LISTS),
+        ("hub_center_error_px", pa.float64()),
     ]
     about = {
         "dataset_sha256": manifest.dataset_sha256,

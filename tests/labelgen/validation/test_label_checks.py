@@ -7,7 +7,8 @@ import pytest
 
 from datasets_manifest.types.records import FeatureView, PairRecord
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from labelgen.validation.label_checks import LATTICE_RMS, check_against_passes
+from labelgen.label_errors import LATTICE_RMS
+from labelgen.validation.label_checks import check_against_passes
 from render.engine import StereoRadiance
 from tests.support.drawn_pairs import Pair
 
