@@ -45,10 +45,47 @@ class DrawnBoxes:
     Attributes:
         path: of the file.
         boxes: in the file's order.
+        image_names: `file_name` of all images of the file, those without a box too.
     """
 
     path: Path
     boxes: tuple[DrawnBox, ...]
+    image_names: tuple[str, ...] = ()
+
+    def of_images(self, names: Sequence[str], sizes_px: Sequence[tuple[int, int]]) -> dict[int, tuple[PixelBox, ...]]:
+        """The boxes on single images, by place among them; empty for an image that the file names without a box.
+
+        Args:
+            names: of the images.
+            sizes_px: (width, height) of each. [px]
+
+        Raises:
+            ValueError: a name that fits several images, a box that was drawn on another size, or none of the file's
+                images is among these.
+        """
+        index = _NameIndex([(name, name) for name in names])
+        found: dict[int, tuple[PixelBox, ...]] = {}
+        for name in self.image_names:
+            place = index.find(name, self.path)
+            if place is not None:
+                found[place[0]] = ()
+        for drawn in self.boxes:
+            place = index.find(drawn.image_name, self.path)
+            if place is None:
+                continue
+            size_px = sizes_px[place[0]]
+            if drawn.size_px not in (None, size_px):
+                raise ValueError(
+                    f"{self.path}: {drawn.image_name} was {_size(drawn.size_px)} px when its box was drawn, and is "
+                    f"{_size(size_px)} px; draw on the pictures as they are"
+                )
+            found[place[0]] = (*found.get(place[0], ()), drawn.box)
+        if not found and (self.image_names or self.boxes):
+            first = (self.image_names or (self.boxes[0].image_name,))[0]
+            raise ValueError(
+                f"{self.path}: none of its images is among these: it names {first}, and they are {names[0]} and so on"
+            )
+        return found
 
     def of_views(
         self, names: Sequence[tuple[str, str]], view_size_px: tuple[int, int]
@@ -165,7 +202,8 @@ def read_boxes(path: Path, category: str | None = None) -> DrawnBoxes:
     except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     try:
-        return DrawnBoxes(path, tuple(_drawn_boxes(table, category)))
+        boxes = tuple(_drawn_boxes(table, category))
+        return DrawnBoxes(path, boxes, tuple(str(image["file_name"]) for image in table["images"]))
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path}: is not a COCO file of boxes: {type(error).__name__} {error}") from error
     except ValueError as error:

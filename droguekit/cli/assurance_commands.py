@@ -1,4 +1,4 @@
-"""Commands that tell what datasets cover, how they differ, and what to render next: coverage, diff, mine."""
+"""Commands that tell what datasets and photographs cover, and what to render next: coverage, diff, mine, real-check."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import BaseModel
 
-from drogue_models.frozen_model import FrozenModel
+from datasets_manifest.storage.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, output_option
+from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, Place, exit_with_fault, output_option
 from droguekit.cli.main import FAULT
 
 EXAMPLES = {
@@ -21,6 +22,11 @@ EXAMPLES = {
     "mine": (
         "droguekit mine data/world --detections boxes.json --out mined.toml",
         "droguekit mine data/world --estimates estimates.jsonl --method joint-hub --kept 0.7 --out mined.toml",
+    ),
+    "real-check": (
+        "droguekit real-check photographs --html check.html",
+        "droguekit real-check photographs --boxes boxes.json --known data/world --html check.html",
+        "droguekit real-check photographs --detector my-network.onnx --boxes boxes.json --json check.json",
     ),
     "diff": (
         "droguekit diff data/world data/world-2",
@@ -149,7 +155,56 @@ def mine(
     _write_numbers(mined, json_)
 
 
-def _write_numbers(found: FrozenModel, out: Path | None) -> None:
+def real_check(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", help="Folder of pictures of any sizes, with the folders in it.", show_default=False
+        ),
+    ],
+    boxes: Annotated[
+        Path | None,
+        typer.Option("--boxes", metavar="FILE.json", help="COCO boxes; a picture that is listed without shows none."),
+    ] = None,
+    box_category: Annotated[
+        str | None, typer.Option("--box-category", metavar="NAME", help="Of the boxes that count; drogue by default.")
+    ] = None,
+    detector: Annotated[
+        str, typer.Option("--detector", metavar="NAME|FILE.onnx", help="Network to look with.")
+    ] = "mobile-s",
+    known: Annotated[
+        Place | None,
+        typer.Option(
+            "--known",
+            metavar="DATASET",
+            parser=str,
+            callback=lambda text: None if text is None else as_location(text),
+            help="Rendered dataset whose conditions the pictures are compared with.",
+        ),
+    ] = None,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Write the boxes and numbers.")] = None,
+    html: Annotated[Path | None, output_option("--html", "FILE", "Write one page with all pictures and boxes.")] = None,
+) -> None:
+    """Look for drogues in photographs, one by one, and show hits, misses and false alarms.
+
+    With --known, also which conditions of a dataset each picture looks like, and which look like none of them.
+
+    Exits with 1 where a picture cannot be read.
+    """
+    from droguekit.assurance.photograph_check import check_lines, check_photographs
+    from droguekit.visualization.photograph_page import write_photograph_page
+
+    found = check_photographs(folder, detector, boxes, box_category, known, progress_report())
+    for line in check_lines(found):
+        typer.echo(line)
+    _write_numbers(found, json_)
+    if html is not None:
+        write_photograph_page(found, folder, html)
+        typer.echo(f"wrote {html}")
+    exit_with_fault(found.fault)
+
+
+def _write_numbers(found: BaseModel, out: Path | None) -> None:
     from datasets_manifest.atomic import write_text_atomic
 
     if out is not None:

@@ -47,6 +47,9 @@ COMMANDS = {
     ),
     "diff": Command("droguekit.cli.assurance_commands", "Tell how two datasets differ beyond chance."),
     "mine": Command("droguekit.cli.assurance_commands", "Write a recipe that draws more of what fails."),
+    "real-check": Command(
+        "droguekit.cli.assurance_commands", "Look for drogues in your own photographs, and compare their looks."
+    ),
     "reproduce": Command("droguekit.cli.dataset_commands", "Render one frame of a dataset again and compare."),
     "export": Command("droguekit.cli.exchange_commands", "Write a dataset's labels in another format."),
     "preview": Command("droguekit.cli.viewing_commands", "Draw a contact sheet of a dataset with its labels."),
@@ -95,8 +98,8 @@ def load_command(name: str) -> Any:
         if not (error.name and f"{error.name}.".startswith(_STUDIES)):
             raise
         raise ValueError(f"{name}: is no part of the installed package; run it in a clone of the repository") from error
-    # Some names are Python keywords, such as `import`.
-    function = getattr(module, f"{name}_" if keyword.iskeyword(name) else name)
+    # Some names are Python keywords, such as `import`, or have a hyphen.
+    function = getattr(module, f"{name}_" if keyword.iskeyword(name) else name.replace("-", "_"))
     examples: tuple[str, ...] = module.EXAMPLES[name]
     # The backspace keeps the help's line breaks.
     epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None

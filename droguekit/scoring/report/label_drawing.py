@@ -47,7 +47,12 @@ def resized(picture: Picture, width_px: int) -> tuple[Picture, float]:
 
 
 def draw_box(
-    tile: Picture, box_px: PixelBox, scale: float, corner_px: PixelPoint = _IMAGE_CORNER, color: Rgb = BOX_RGB
+    tile: Picture,
+    box_px: PixelBox,
+    scale: float,
+    corner_px: PixelPoint = _IMAGE_CORNER,
+    color: Rgb = BOX_RGB,
+    line_px: int = 1,
 ) -> None:
     """Draw a box of an image into a resized copy of it, or an enlarged cut-out.
 
@@ -57,10 +62,11 @@ def draw_box(
         scale: size of the copy over that of what it shows.
         corner_px: low corner of what it shows.
         color: red, green, blue.
+        line_px: width of the lines.
     """
     x, y, width, height = box_px
     low, high = (_fixed_point(end, scale, corner_px) for end in ((x, y), (x + width, y + height)))
-    cv2.rectangle(tile, low, high, color, 1, cv2.LINE_AA, _SHIFT)
+    cv2.rectangle(tile, low, high, color, line_px, cv2.LINE_AA, _SHIFT)
 
 
 def draw_crosses(
