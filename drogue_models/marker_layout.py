@@ -7,11 +7,32 @@ from functools import cached_property
 
 import numpy as np
 
+from drogue_models.bodies import BasketBody
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, read_only
 
 # Tolerance of an even ring of markers, far below the accuracy of any centroid.
 _RING_TOLERANCE_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RimOutline:
+    """What a drogue's outline against the background is made of.
+
+    Attributes:
+        radius_m: outermost radius of the rim's tube. [m]
+        tube_radius_m: of the tube, whose circle lies as far behind the rim plane. [m]
+        bulges_m: (K, 2) circles (radius, z) about the axis, within which all that is behind the rim lies. [m]
+        is_known: whether nothing else reaches as far out as the rim.
+    """
+
+    radius_m: float
+    tube_radius_m: float
+    bulges_m: Array
+    is_known: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bulges_m", read_only(self.bulges_m, (-1, 2), "bulges_m"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +46,7 @@ class MarkerLayout:
         hub_inner_radius_m, hub_outer_radius_m: its edges, 0 without a hub. [m]
         face_inner_radius_m, face_outer_radius_m: edges of the dark face around the markers, 0 without one. [m]
         collar_radius_m: outer edge of the coupling around the hub, 0 where unknown. [m]
+        rim: the outline, or None where unknown.
     """
 
     centers_m: Array
@@ -35,6 +57,7 @@ class MarkerLayout:
     face_inner_radius_m: float = 0.0
     face_outer_radius_m: float = 0.0
     collar_radius_m: float = 0.0
+    rim: RimOutline | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centers_m", read_only(self.centers_m, (-1, 3), "centers_m"))
@@ -86,4 +109,13 @@ def marker_layout(drogue: DrogueParameters) -> MarkerLayout:
         drogue.face_inner_radius_m if has_face else 0.0,
         drogue.rim_radius_m if has_face else 0.0,
         drogue.coupling_radius_m,
+        _rim_outline(drogue),
     )
+
+
+def _rim_outline(drogue: DrogueParameters) -> RimOutline:
+    body = drogue.body
+    # A user's mesh may reach anywhere, and an inflated tube around the mouth is wider than the rim behind it.
+    is_known = drogue.body_mesh is None and not (isinstance(body, BasketBody) and body.canopy.style == "tube")
+    bulges_m = np.array(drogue.bulges_m).reshape(-1, 2)
+    return RimOutline(drogue.rim_radius_m, drogue.rim_tube_radius_m, bulges_m, is_known)

@@ -23,7 +23,7 @@ from datasets_manifest.types.estimates import Estimate, Region
 from datasets_manifest.types.images import Pixels, StereoImages
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.parameters import DrogueParameters
-from geometry.se3 import Array
+from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_centroids import (
     NO_CENTROIDS,
@@ -41,6 +41,7 @@ from nav.detector.ring_detectors import ColorBlobDetector
 from nav.lens_correction import undistort_centroids
 from nav.matching.face_ring import DROWNED_RADIUS_PX
 from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
+from nav.matching.rim_edges import measure_rim
 from nav.matching.ring_matching import (
     FEW,
     RingMatch,
@@ -53,7 +54,7 @@ from nav.matching.ring_matching import (
 from nav.pair_measurement import PairMeasurement, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
-from nav.tracking.region import rim_boxes
+from nav.tracking.region import Box, rim_boxes
 
 Result = TypeVar("Result")
 # Sources of regions that are not a tracker's: the detector, or a prediction from the other eye.
@@ -67,6 +68,8 @@ CENTROID_CHOICES: tuple[CentroidChoice, ...] = ("own", "binary", "edge")
 BINARY_METHODS = frozenset(
     {"paper", "paper-literal", "circle-fit", "mono-circle", "mean-plane", "disparity-plane", "constant"}
 )
+# Those that measure the rim's edge instead of markers.
+RIM_METHODS = frozenset({"joint-rim"})
 
 # Three markers determine a pose.
 _LEAST_MARKERS = 3
@@ -157,9 +160,9 @@ class PairNavigator:
 
     def measure(self, images: StereoImages, regions: tuple[Region, ...]) -> PairMeasurement:
         """Measure the markers in these regions of one pair by the binary chain, and match them."""
-        fault = self._unusable(images)
+        fault = self._unusable(images) or too_few_markers(self._layout)
         if fault is not None or not regions:
-            return PairMeasurement(fault or NOT_DETECTED, {})
+            return PairMeasurement(fault or NOT_DETECTED, {}, regions=regions)
         best = self._matched(images, regions, PLAIN)
         has_others = self._color is not None and images.left.ndim == 3
         for weight in OTHERS_WEIGHTS[1:] if has_others else ():
@@ -172,9 +175,6 @@ class PairNavigator:
 
     def _unusable(self, images: StereoImages) -> NoFixReason | None:
         """Why nothing can be measured in these images."""
-        few = too_few_markers(self._layout)
-        if few is not None:
-            return few
         size_px = (self._rig.camera.width_px, self._rig.camera.height_px)
         if images.size_px == size_px:
             return None
@@ -246,7 +246,38 @@ class PairNavigator:
         """As `estimate`, from markers that were measured already."""
         wants_edges = {method: self._wants_edges(method) for method in methods}
         fine = self.refine(images, rough) if any(wants_edges.values()) else rough
-        return [estimate_pose(frame_index, fine if wants_edges[method] else rough, method) for method in methods]
+        measured = {method: fine if wants_edges[method] else rough for method in methods}
+        if not RIM_METHODS.isdisjoint(methods):
+            measured |= dict.fromkeys(RIM_METHODS, self.measure_rim(images, rough))
+        return [estimate_pose(frame_index, measured[method], method) for method in methods]
+
+    def measure_rim(self, images: StereoImages, measurement: PairMeasurement) -> PairMeasurement:
+        """Measure the rim's edge where the markers of a pair were searched, found or not."""
+        rig, rim, regions = self._rig, self._layout.rim, measurement.regions
+        stage_s = {stage: s for stage, s in measurement.stage_s.items() if stage == "detect"}
+        fault = self._unusable(images)
+        if fault is not None or not regions:
+            return PairMeasurement(fault or NOT_DETECTED, stage_s)
+        start = perf_counter()
+        edges = None
+        if rim is not None and rim.is_known:
+            boxes = {region.eye: region.box_xywh_px for region in regions}
+            edges = measure_rim(images, rig, self._boxes_in_both(boxes), 2 * rim.tube_radius_m / rim.radius_m)
+        none = np.full((len(EYES), self._layout.count, 2), np.nan)
+        no_cov = np.full((*none.shape, 2), np.nan)
+        observation = Observation(rig, self._layout, none, no_cov, tolerances=self._tolerances, rim=edges)
+        return PairMeasurement(observation, stage_s | {"rim": perf_counter() - start}, regions=regions)
+
+    def _boxes_in_both(self, boxes: dict[Eye, Box]) -> dict[Eye, Box]:
+        """Boxes in both eyes; one that was not found lies where the size of the other one puts it."""
+        if len(boxes) == len(EYES):
+            return boxes
+        ((eye, (x, y, width, height)),) = boxes.items()
+        depth_m = self._rig.camera.fx_px * 2 * self._rim_radius_m / max(width, height)
+        middle_m = depth_m * self._rig.rays((x + width / 2, y + height / 2), eye) + self._rig.eye_offset_m(eye)
+        predicted = rim_boxes(self._rig, self._rim_radius_m, RigidTransform(np.eye(3), middle_m))
+        others = {region.eye: region.box_xywh_px for region in regions_of(predicted, OTHER_EYE)}
+        return others | boxes
 
     def refine(self, images: StereoImages, measurement: PairMeasurement) -> PairMeasurement:
         """Measure the same markers by the edge model, and the hub."""
@@ -260,6 +291,8 @@ class PairNavigator:
         )
 
     def _wants_edges(self, method: str) -> bool:
+        if method in RIM_METHODS:
+            return False
         return self._centroids == "edge" or (self._centroids == "own" and method not in BINARY_METHODS)
 
 
@@ -268,7 +301,7 @@ def too_few_markers(layout: MarkerLayout) -> NoFixReason | None:
     if layout.count >= _LEAST_MARKERS:
         return None
     has = "no markers" if layout.count == 0 else f"{layout.count} marker{'s' * (layout.count > 1)}"
-    return NoFixReason(f"the drogue has {has}, a pose needs {_LEAST_MARKERS}; detectors still give its box")
+    return NoFixReason(f"the drogue has {has}, a pose needs {_LEAST_MARKERS}; joint-rim measures its rim")
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.roll_decoder import DecodedRoll, RollDecoder, turned_to, with_decoded_roll
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.pair_measurement import PairMeasurement
-from nav.pair_navigator import CentroidChoice, PairNavigator
+from nav.pair_navigator import RIM_METHODS, CentroidChoice, PairNavigator
 from nav.pose.pose_method import NoFixReason
 from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
@@ -210,13 +210,17 @@ class SequenceNavigator:
             pair.frame_index, pair.images, measured.measurement, settings.methods
         )
         roll = self._decoded_roll(measured, estimates)
-        estimates = [with_decoded_roll(estimate, pair.drogue, roll) for estimate in estimates]
+        # The rim leaves the roll open, and so its poses are at none that the markers' symmetry allows.
+        rolls = [None if method in RIM_METHODS else roll for method in settings.methods]
+        estimates = [
+            with_decoded_roll(estimate, pair.drogue, roll) for estimate, roll in zip(estimates, rolls, strict=True)
+        ]
         if not settings.filtered:
             return estimates, []
         if measured.begins or not self._filters:
             order = marker_layout(pair.drogue).symmetry_order
             self._filters = {method: PoseFilter(settings.motion, order) for method in settings.methods}
-        return estimates, [self._filtered(pair, estimate, roll) for estimate in estimates]
+        return estimates, [self._filtered(pair, *each) for each in zip(estimates, rolls, strict=True)]
 
     def _decoded_roll(self, measured: MeasuredPair, estimates: Sequence[Estimate]) -> DecodedRoll | None:
         """The roll by the blinking of lamps, of the first method that has a pose; None where lamps do not blink."""
@@ -225,7 +229,11 @@ class SequenceNavigator:
             return None
         if measured.begins or self._roll_decoder is None:
             self._roll_decoder = RollDecoder(pair.rig, pair.drogue)
-        poses = (estimate.left_from_drogue for estimate in estimates if isinstance(estimate, PoseEstimate))
+        poses = (
+            estimate.left_from_drogue
+            for estimate in estimates
+            if isinstance(estimate, PoseEstimate) and estimate.method not in RIM_METHODS
+        )
         pose = next(poses, None)
         return None if pose is None else self._roll_decoder.decode(pair.images, pose)
 

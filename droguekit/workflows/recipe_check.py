@@ -124,7 +124,10 @@ def check_recipe(recipe: Recipe) -> RecipeCheck:
     if recipe.board is not None:
         raise ValueError("check: the recipe shows a calibration board and no drogue")
     if marker_layout(recipe.drogue).count == 0:
-        raise ValueError(f"check: the drogue {recipe.drogue.name} has no markers; detectors still give its box")
+        raise ValueError(
+            f"check: the drogue {recipe.drogue.name} has no markers to predict; the method joint-rim takes its pose "
+            "from the rim where it stands dark before the sky"
+        )
     scenes = dict(_scenes(recipe))
     lights = tuple(scene.told(light) for light, scene in scenes.items())
     markers = tuple(
@@ -332,7 +335,7 @@ def _advice(recipe: Recipe, check: RecipeCheck, scenes: dict[str, _Scene]) -> It
         needed_m = np.ceil(1e3 * _SMALLEST_RADIUS_PX * near[-1].distance_m / recipe.rig.camera.fx_px) / 1e3
         yield (
             f"markers are below {_SMALLEST_RADIUS_PX} px radius from {small[0]:.3g} m on: use a radius of "
-            f"{needed_m:.2g} m or a longer lens"
+            f"{needed_m:.2g} m, a longer lens, or by day the method joint-rim, which measures the rim"
         )
     close = [row.distance_m for row in near if row.gap_px < _LEAST_GAP_PX]
     if close:

@@ -77,6 +77,8 @@ _CLEAR_OF_RIM_PX, _BEYOND_RIM = 2.5, 1.4
 # Limits of the balancing weight, from blue skies to warm ones.
 _WEIGHTS = (0.0, 1.6)
 
+# Share of clipped pixels up to which a colour counts, and sites of each colour in a cell.
+_HARDLY_CLIPPED, _MOSAIC_SITES = 0.02, (1.0, 2.0, 1.0)
 # Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
 _SITE_OFFSET_PX = (0.0, 0.5, 1.0)
 _RED, _GREEN = 0, 1
@@ -199,6 +201,34 @@ def linear_light(images: StereoImages, eye: Eye, window: Window) -> tuple[NDArra
     if mosaic is None and images.encoding == "gamma":
         return _linear(part, images).astype(np.float32), part >= 2**images.bits - 1
     return part.astype(np.float32) - np.float32(images.black_level_dn), part >= 2**images.bits - 1
+
+
+def brightness(images: StereoImages, eye: Eye, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Light of all colours in a part of an image, green twice as in a mosaic; of green alone where another is clipped.
+
+    Args:
+        images: the pair.
+        eye: which of the two.
+        window: left, top, right, bottom (the last two exclusive) of the part.
+
+    Returns:
+        (H, W) proportional to light above the black level, and (H, W) whether one of these colours is clipped.
+    """
+    left, top, right, bottom = window
+    part = (images.left if eye == "left" else images.right)[top:bottom, left:right]
+    if images.encoding == "gamma":
+        light = _linear(part, images).astype(np.float32)
+    else:
+        light = part.astype(np.float32) - np.float32(images.black_level_dn)
+    clipped = part >= 2**images.bits - 1
+    if part.ndim == 2:
+        return light, clipped
+    shares = clipped.mean(axis=(0, 1))
+    chosen = shares <= max(_HARDLY_CLIPPED, float(shares.min()))
+    if not chosen.all() and chosen[_GREEN]:
+        chosen = np.arange(3) == _GREEN
+    weights = np.where(chosen, _MOSAIC_SITES, 0).astype(np.float32)
+    return light @ (weights / weights.sum()), clipped[..., chosen].any(axis=2)
 
 
 def _linear(image: Pixels, images: StereoImages) -> Pixels:

@@ -45,7 +45,7 @@ from nav.pose.pose_method import (
 # Standard deviation of pitch and of yaw for drogues that swing uniformly within 10 degrees: 5.8 degrees.
 TILT_PRIOR_RAD = np.radians(6.0)
 # The sign of a tilt is reliable beyond this many standard deviations of the tilt of a frontal drogue: wrong in 0.1 %.
-_RELIABLE_SIGMAS = 3.0
+RELIABLE_SIGMAS = 3.0
 # Starts that end closer to each other than this found one minimum.
 _SAME_TURN_RAD = 1e-4
 # Keeps the affine fit of collinear markers solvable; negligible for all others.
@@ -101,12 +101,12 @@ def solve_joint_batch(
 
 def solve_features(features: Features) -> JointBatch:
     """As `solve_joint_batch`, from stacked features."""
-    tilts = _TiltPairs.of(adjust_both_tilts(features, *two_fold_starts(features)))
+    tilts = TiltPairs.of(adjust_both_tilts(features, *two_fold_starts(features)))
     tilts = tilts.ordered(np.argsort(tilts.costs, axis=1, kind="stable"))
     best_rotations, best_translations = tilts.rotations[:, 0], tilts.translations_m[:, 0]
     covariances, sound = inverse_information(tilts.information[:, 0])
     sound &= np.isfinite(tilts.costs[:, 0]) & (best_rotations[:, 2, 2] > 0) & (best_translations[:, 2] > 0)
-    weights = _mode_weights(tilts, TILT_PRIOR_RAD)
+    weights = mode_weights(tilts, TILT_PRIOR_RAD)
     reliable = _tilt_sign_reliable(features, best_rotations, best_translations) | ~sound
 
     rotations, translations = best_rotations.copy(), best_translations.copy()
@@ -114,7 +114,7 @@ def solve_features(features: Features) -> JointBatch:
     if len(ambiguous):
         starts = (tilts.rotations[ambiguous], tilts.translations_m[ambiguous])
         with_prior, prior_weights = _adjust_with_tilt_prior(features.take(ambiguous), *starts)
-        rotations[ambiguous], translations[ambiguous], covariances[ambiguous] = _mixture_mean(with_prior, prior_weights)
+        rotations[ambiguous], translations[ambiguous], covariances[ambiguous] = mixture_mean(with_prior, prior_weights)
         tilts.replace(ambiguous, with_prior)
         weights[ambiguous] = prior_weights
     return JointBatch(
@@ -130,10 +130,10 @@ def solve_features(features: Features) -> JointBatch:
     )
 
 
-def _adjust_with_tilt_prior(features: Features, rotations: Array, translations_m: Array) -> tuple[_TiltPairs, Array]:
+def _adjust_with_tilt_prior(features: Features, rotations: Array, translations_m: Array) -> tuple[TiltPairs, Array]:
     """Adjust (B, 2) starts with the prior on the tilt, and order both by their weights (B, 2), the larger first."""
-    tilts = _TiltPairs.of(adjust_both_tilts(features, rotations, translations_m, Loss(tilt_prior_rad=TILT_PRIOR_RAD)))
-    weights = _mode_weights(tilts, np.inf)
+    tilts = TiltPairs.of(adjust_both_tilts(features, rotations, translations_m, Loss(tilt_prior_rad=TILT_PRIOR_RAD)))
+    weights = mode_weights(tilts, np.inf)
     order = np.argsort(-weights, axis=1, kind="stable")
     return tilts.ordered(order), np.take_along_axis(weights, order, axis=1)
 
@@ -233,7 +233,7 @@ def _largest_singular_values(linear: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _TiltPairs:
+class TiltPairs:
     """Adjusted poses from both starts of B frames, (B, 2, ...)."""
 
     rotations: Array
@@ -242,25 +242,28 @@ class _TiltPairs:
     information: Array
 
     @staticmethod
-    def of(adjusted: AdjustedPoses) -> _TiltPairs:
+    def of(adjusted: AdjustedPoses) -> TiltPairs:
+        """The pairs among 2 B poses, the two of a frame after each other."""
         size = adjusted.information.shape[-1]
-        return _TiltPairs(
+        return TiltPairs(
             adjusted.rotations.reshape(-1, 2, 3, 3),
             adjusted.translations_m.reshape(-1, 2, 3),
             adjusted.costs.reshape(-1, 2),
             adjusted.information.reshape(-1, 2, size, size),
         )
 
-    def ordered(self, order: NDArray[np.int64]) -> _TiltPairs:
+    def ordered(self, order: NDArray[np.int64]) -> TiltPairs:
+        """The pairs with their members in (B, 2) orders."""
         rows = np.arange(len(order))[:, None]
-        return _TiltPairs(*(values[rows, order] for values in vars(self).values()))
+        return TiltPairs(*(values[rows, order] for values in vars(self).values()))
 
-    def replace(self, frames: NDArray[np.int64], other: _TiltPairs) -> None:
+    def replace(self, frames: NDArray[np.int64], other: TiltPairs) -> None:
+        """Put the pairs of other poses in the places of these frames."""
         for own, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
             own[frames] = replacement
 
 
-def _mode_weights(pairs: _TiltPairs, prior_rad: float) -> Array:
+def mode_weights(pairs: TiltPairs, prior_rad: float) -> Array:
     """(B, 2) posterior probabilities by Laplace's approximation, `exp(-cost) |information|^(-1/2)` times a tilt prior.
 
     They are zero for a pose behind the cameras and for the second of two equal poses.
@@ -287,11 +290,11 @@ def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Ar
     variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
     # The cosine of small tilts is lost in rounding; the cross product is not.
     tilt = np.sqrt((cross(rotations[:, :, 2], frontal[:, :, 2]) ** 2).sum(axis=1))
-    reliable: NDArray[np.bool_] = determined & (tilt > _RELIABLE_SIGMAS * np.sqrt(variance))
+    reliable: NDArray[np.bool_] = determined & (tilt > RELIABLE_SIGMAS * np.sqrt(variance))
     return reliable
 
 
-def _mixture_mean(pairs: _TiltPairs, weights: Array) -> tuple[Array, Array, Array]:
+def mixture_mean(pairs: TiltPairs, weights: Array) -> tuple[Array, Array, Array]:
     """Mean rotations (B, 3, 3), translations (B, 3) and covariances (B, 6, 6) of mixtures of two Gaussians."""
     count, size = len(weights), pairs.information.shape[-1]
     first = pairs.rotations[:, 0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, entry_points
 
 from nav.pose.joint import joint, joint_hub, joint_robust
+from nav.pose.joint_rim import joint_rim
 from nav.pose.monocular import mono_circle, mono_ippe, mono_lm, mono_sqpnp
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 from nav.pose.triangulation_methods import circle_fit, constant, disparity_plane, mean_plane, paper, paper_literal
@@ -28,6 +29,7 @@ METHODS: dict[str, PoseMethod] = {
     "joint": joint,
     "joint-hub": joint_hub,
     "joint-robust": joint_robust,
+    "joint-rim": joint_rim,
     "constant": constant,
 }
 

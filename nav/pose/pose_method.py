@@ -53,6 +53,27 @@ INNER_EDGE, OUTER_EDGE = range(HUB_EDGES)
 
 
 @dataclass(frozen=True, eq=False)
+class RimEdges:
+    """Points on the rim's outer edge in the ideal images.
+
+    Attributes:
+        eyes: (K,) 0 for the left eye, 1 for the right one.
+        points_px: (K, 2). [px]
+        normals: (K, 2) unit vectors across the edge, away from the drogue.
+        sigma_px: (K,) standard deviations along the normals. [px]
+        seen_fraction: (2,) share of the circumference on which either eye shows an edge.
+        darkness: (2,) share of the background's light that is missing inside the edge, in four fifths of what is seen.
+    """
+
+    eyes: NDArray[np.int64]
+    points_px: Array
+    normals: Array
+    sigma_px: Array
+    seen_fraction: tuple[float, float]
+    darkness: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
 class Observation:
     """Measured features of one stereo pair, matched with the drogue.
 
@@ -65,6 +86,7 @@ class Observation:
             for no hub.
         hub_cov_px2: (2, 2, 2, 2) their covariances; None where `hub_px` is None.
         tolerances: of the true drogue and rig about `layout` and `rig`.
+        rim: the rim's edge, or None where it was not measured.
     """
 
     rig: StereoRig
@@ -74,6 +96,7 @@ class Observation:
     hub_px: Array | None = None
     hub_cov_px2: Array | None = None
     tolerances: StatedTolerances = EXACT
+    rim: RimEdges | None = None
 
     def __post_init__(self) -> None:
         if (self.hub_px is None) != (self.hub_cov_px2 is None):

@@ -24,7 +24,7 @@ from droguekit.cli.main import COMMANDS, DONE, FAULT, INTERRUPTED, WRONG_INPUT, 
 from droguekit.workflows.rendering import MOST_TIMEOUT_S
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
-from nav.pair_navigator import BINARY_METHODS
+from nav.pair_navigator import BINARY_METHODS, RIM_METHODS
 from nav.pose.method_registry import ENTRY_POINT_GROUP
 from nav.pose.pose_method import Observation, Solution
 from nav.runner import method_names
@@ -154,9 +154,12 @@ def test_pages_named_in_the_code_exist() -> None:
 
 
 def test_the_table_of_methods_names_their_centroids() -> None:
-    rows = re.findall(r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge) \|$", text("docs/reference/methods.md"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge|rim) \|$", text("docs/reference/methods.md"), re.MULTILINE
+    )
     centroids = {name: kind for names, kind in rows for name in re.findall(r"`([^`]+)`", names)}
-    assert centroids == {name: "binary" if name in BINARY_METHODS else "edge" for name in method_names()}
+    kinds = dict.fromkeys(BINARY_METHODS, "binary") | dict.fromkeys(RIM_METHODS, "rim")
+    assert centroids == {name: kinds.get(name, "edge") for name in method_names()}
 
 
 @pytest.mark.parametrize(

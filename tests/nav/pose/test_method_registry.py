@@ -18,7 +18,7 @@ from tests.support.painted_pairs import draw_poses
 
 NAMES = (
     "paper paper-literal circle-fit mono-circle mean-plane disparity-plane mono-ippe mono-sqpnp mono-lm "
-    "joint joint-hub joint-robust constant"
+    "joint joint-hub joint-robust joint-rim constant"
 )
 
 MODULE = """
