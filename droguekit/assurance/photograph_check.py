@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,14 @@ from droguekit.assurance.picture_looks import KnownLooks, known_looks, measure_l
 from droguekit.batch.progress import ProgressReport
 from droguekit.scoring.detection.detection_metrics import AT_50, Evaluation
 from droguekit.scoring.detection.detection_truth import ImageTruth
-from droguekit.scoring.results.detection_result import DetectedBox, center_box, clipped_box, corner_box, image_id_of
+from droguekit.scoring.results.detection_result import (
+    DROGUE_CATEGORY,
+    DetectedBox,
+    center_box,
+    clipped_box,
+    corner_box,
+    image_id_of,
+)
 from droguekit.scoring.results.pose_result import ResultModel
 from nav.detector.detector_registry import network_file
 from nav.detector.onnx_detector import OnnxDetector
@@ -163,24 +171,29 @@ def shown_photograph(path: Path) -> NDArray[np.uint8]:
 def check_photographs(
     folder: Path,
     detector: str,
-    boxes: Path | None,
-    category: str | None,
-    known: Location | None,
     report: ProgressReport,
+    *,
+    boxes: Path | None = None,
+    category: str | None = None,
+    known: Location | None = None,
+    least_score: float | None = None,
 ) -> PhotographCheck:
     """Look for drogues in all photographs of a folder, score them where boxes were drawn, and compare their looks.
 
     Args:
         folder: of the photographs, each of any size.
         detector: a shipped network, or a file `*.onnx`.
+        report: is told of the progress.
         boxes: COCO file of boxes that somebody drew; pictures that it names without a box show no drogue.
         category: of the boxes; None for drogue.
         known: dataset whose pictures are compared by their looks, or None.
-        report: is told of the progress.
+        least_score: from which a box counts; None for the network's own threshold.
 
     Raises:
-        ValueError: no pictures, a file that cannot be used, or a detector that is no network.
+        ValueError: no pictures, a file that cannot be used, a detector that is no network, or a score outside 0 to 1.
     """
+    if least_score is not None and not 0 <= least_score <= 1:
+        raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
     paths = find_photographs(folder)
     drawn_boxes = None if boxes is None else read_boxes(boxes, category)
     file = network_file(detector)
@@ -192,7 +205,7 @@ def check_photographs(
     drawn = {}
     if drawn_boxes is not None and seen:
         drawn = drawn_boxes.of_images([one.name for one in seen], [one.size_px for one in seen])
-    threshold = network.metadata.score_threshold
+    threshold = network.metadata.score_threshold if least_score is None else least_score
     ap50, judged = _judged(seen, drawn, threshold)
     photographs = tuple(_result(one, judged[place], drawn.get(place), looks) for place, one in enumerate(seen))
     return PhotographCheck(
@@ -293,6 +306,28 @@ def _result(
         looks_distance=None if likeness is None else likeness.distance,
         difference=None if likeness is None else likeness.difference,
     )
+
+
+def coco_table(found: PhotographCheck) -> dict[str, Any]:
+    """The found boxes as a COCO file with images, as annotation tools read it; scores are beside the boxes."""
+    images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
+    for number, one in enumerate(found.photographs, start=1):
+        images.append({"id": number, "file_name": one.name, "width": one.width_px, "height": one.height_px})
+        for box in one.found:
+            corner = [round(value, 2) for value in corner_box(box.box_xywh_px)]
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": number,
+                    "category_id": DROGUE_CATEGORY,
+                    "bbox": corner,
+                    "area": round(corner[2] * corner[3], 2),
+                    "iscrowd": 0,
+                    "score": round(box.score, 6),
+                }
+            )
+    categories = [{"id": DROGUE_CATEGORY, "name": "drogue"}]
+    return {"images": images, "annotations": annotations, "categories": categories}
 
 
 def check_lines(found: PhotographCheck) -> Iterator[str]:

@@ -172,6 +172,10 @@ def real_check(
     detector: Annotated[
         str, typer.Option("--detector", metavar="NAME|FILE.onnx", help="Network to look with.")
     ] = "mobile-s",
+    least_score: Annotated[
+        float | None,
+        typer.Option("--least-score", help="Boxes with a lower score do not count; the detector's own by default."),
+    ] = None,
     known: Annotated[
         Place | None,
         typer.Option(
@@ -194,7 +198,15 @@ def real_check(
     from droguekit.assurance.photograph_check import check_lines, check_photographs
     from droguekit.visualization.photograph_page import write_photograph_page
 
-    found = check_photographs(folder, detector, boxes, box_category, known, progress_report())
+    found = check_photographs(
+        folder,
+        detector,
+        progress_report(),
+        boxes=boxes,
+        category=box_category,
+        known=known,
+        least_score=least_score,
+    )
     for line in check_lines(found):
         typer.echo(line)
     _write_numbers(found, json_)

@@ -24,6 +24,7 @@ EXAMPLES = {
         "droguekit detect data/demo --detector color-blob --out color-blob.json",
         "droguekit detect data/flight --detector my-network.onnx --out detections.json",
         "droguekit detect data/docking-10m --tracker bernoulli --out tracked.json",
+        "droguekit detect photographs --mono --out boxes.json   (single pictures of any size)",
     ),
     "train": (
         "droguekit train detector-small --out out/detector   (renders the recipe first)",
@@ -56,7 +57,13 @@ def detect(
     dataset: DatasetArgument,
     out: Annotated[Path, output_option("--out", "FILE.json", "Write the boxes as COCO results.")],
     detector: DetectorOption = None,
-    least_score: Annotated[float, typer.Option("--least-score", help="Omit boxes with a lower score.")] = 0.001,
+    least_score: Annotated[
+        float | None,
+        typer.Option(
+            "--least-score",
+            help="Omit boxes with a lower score; 0.001 by default, with --mono the detector's own threshold.",
+        ),
+    ] = None,
     tracker: Annotated[
         str | None,
         typer.Option(
@@ -66,6 +73,12 @@ def detect(
             "when the drogue is lost, and on every 25th pair. docs/explanation/tracking.md.",
         ),
     ] = None,
+    mono: Annotated[
+        bool,
+        typer.Option(
+            "--mono", help="DIR is a folder of single pictures of any sizes; write a COCO file that names them."
+        ),
+    ] = False,
 ) -> None:
     """Find the drogue in every image of a dataset, from images, rig and drogue dimensions alone.
 
@@ -73,8 +86,19 @@ def detect(
     plus 1 for the left or 2 for the right image. Exits with 1 where a pair cannot be read or our own code fails in it;
     it then has no boxes.
     """
-    from droguekit.workflows.detection import detect_dataset
+    from droguekit.workflows.detection import detect_dataset, detect_photographs
 
+    if mono:
+        from droguekit.assurance.photograph_check import check_lines
+
+        if tracker is not None or not isinstance(dataset, Path):
+            raise ValueError("--mono: takes a folder of this machine, and single pictures cannot be tracked")
+        found = detect_photographs(dataset, detector, out, least_score, progress_report())
+        typer.echo(next(check_lines(found)))
+        typer.echo(f"wrote {out}")
+        exit_with_fault(found.fault)
+        return
+    least_score = 0.001 if least_score is None else least_score
     counts = detect_dataset(dataset, detector, out, least_score, progress_report(), tracker)
     typer.echo(
         f"{counts.detector}: {counts.boxes} boxes in {counts.images_with_boxes} of {2 * counts.pairs} images, "

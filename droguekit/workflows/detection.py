@@ -19,6 +19,7 @@ from droguekit.workflows.rendering import open_recipe, render_frames
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import RecipeSource
     from datasets_manifest.storage.storage import Location
+    from droguekit.assurance.photograph_check import PhotographCheck
     from droguekit.batch.progress import ProgressReport
     from droguekit.scoring.results.detection_result import DetectedBox, PairTimes
     from nav.training.training_run import TrainingResult
@@ -137,6 +138,25 @@ class DetectionSummary:
     pairs: int
     times: PairTimes
     fault: str | None = None
+
+
+def detect_photographs(
+    folder: Path, name_or_file: str | None, out: Path, least_score: float | None, report: ProgressReport
+) -> PhotographCheck:
+    """Find drogues in single pictures, one by one, and write them as a COCO file with images and scores.
+
+    Raises:
+        ValueError: no pictures, no such network, or a score outside 0 to 1.
+        OSError: the file cannot be written; it stays as it was.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from datasets_manifest.storage.writer import canonical_json
+    from droguekit.assurance.photograph_check import check_photographs, coco_table
+    from nav.detector.detector_registry import DEFAULT_DETECTOR
+
+    found = check_photographs(folder, name_or_file or DEFAULT_DETECTOR, report, least_score=least_score)
+    write_text_atomic(out, canonical_json(coco_table(found)) + "\n")
+    return found
 
 
 def detect_dataset(

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pycocotools.coco import COCO
 
 from datasets_manifest.storage.reader import Dataset
 from droguekit.assurance.photograph_check import PhotographCheck, check_lines, check_photographs, find_photographs
@@ -70,7 +71,7 @@ def drawn(rendered: Path, shift_px: float = 0.0) -> dict[str, object]:
 
 
 def checked(folder: Path, boxes: Path | None = None, known: Path | None = None) -> PhotographCheck:
-    return check_photographs(folder, "mobile-s", boxes, None, known, progress_report())
+    return check_photographs(folder, "mobile-s", progress_report(), boxes=boxes, known=known)
 
 
 def test_hits_misses_and_false_alarms(photographs: Path, rendered: Path, tmp_path: Path) -> None:
@@ -129,6 +130,23 @@ def test_wrong_input(
     assert run(["real-check", *given]) == WRONG_INPUT
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
+
+
+def test_found_boxes_can_be_drawn_ones(photographs: Path, tmp_path: Path) -> None:
+    """What `detect --mono` writes is what an annotation tool corrects and what `--boxes` reads."""
+    (photographs / "broken.jpg").unlink()
+    out = tmp_path / "found.json"
+    assert run(["detect", str(photographs), "--mono", "--out", str(out)]) == DONE
+    coco = COCO(str(out))
+    assert [coco.imgs[number]["file_name"] for number in sorted(coco.imgs)][3] == "more/c.tiff"
+    again = checked(photographs, out)
+    assert len(again.judged) == 5 and again.ap50 == pytest.approx(100.0)
+    assert sum(one.hits for one in again.photographs) == len(coco.anns) == 3
+    few = tmp_path / "few.json"
+    assert run(["detect", str(photographs), "--mono", "--least-score", "1", "--out", str(few)]) == DONE
+    assert COCO(str(few)).anns == {}
+    for words in (["--tracker", "flow"], ["--least-score", "2"]):
+        assert run(["detect", str(photographs), "--mono", *words, "--out", str(few)]) == WRONG_INPUT
 
 
 def test_pictures_are_found_in_folders_and_hidden_ones_are_not(photographs: Path) -> None:
