@@ -25,7 +25,7 @@ from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import Drop
 from datasets_manifest.storage.reader import read_record_table
 from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop
-from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
+from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan, family_index
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array
 from render.device import Device
@@ -245,8 +245,8 @@ class CostEstimate:
         return max(1, min(workers, self.count), math.ceil(self.count / WorkerLimits().tasks_per_process))
 
 
-def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes: int | None = None) -> CostEstimate:
-    """Render a few frames, spread over distances and families, and estimate the cost of all from them.
+def probe_recipe(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes: int | None = None) -> ProbeResult:
+    """Render a few frames, spread over distances and families, from which `estimate_cost` tells the cost of all.
 
     Args:
         recipe: whose cost is estimated.
@@ -258,8 +258,7 @@ def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu", probes:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    frames = choose_probe_frames(plan.drawn, recipe.frames.count, probes)
-    return estimate_cost(recipe, plan, probe(recipe, frames, device))
+    return probe(recipe, choose_probe_frames(plan.drawn, recipe.frames.count, probes), device)
 
 
 def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> CostEstimate:
@@ -267,7 +266,7 @@ def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> Cost
     reports = list(probed.counted.values())
     every = [*probed.warm_up.values(), *reports]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
-    fit = _DistanceFit(plan.drawn, probed.counted)
+    fit = _DistanceFit(recipe, plan.drawn, probed.counted)
     # Every pair takes in this stage what one takes whose environment exists already.
     rest_s = [cpu_s(report) - _scene_stage_s(report) for report in reports]
     frames_s, error_s = fit.total([seconds + probed.drawn_again_s for seconds in rest_s], count)
@@ -289,10 +288,12 @@ def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> Cost
 class _DistanceFit:
     """A fit of measured values over distance, in which each family counts by its share of the recipe."""
 
-    def __init__(self, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
-        rows = [drawn.indices.index(frame_index) for frame_index in reports]
-        self._measured_m, self._drawn_m = drawn.distances_m[rows], drawn.distances_m
-        shows, families = np.isfinite(self._measured_m), drawn.families[rows]
+    def __init__(self, recipe: Recipe, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
+        distances_m = [math.nan if report.distance_m is None else report.distance_m for report in reports.values()]
+        self._measured_m, self._drawn_m = np.array(distances_m), drawn.distances_m
+        # Measured frames need not be among the drawn ones of a recipe that has another number of pairs.
+        families = np.array([family_index(recipe, scene_of_frame(recipe, index)) for index in reports], dtype=np.intp)
+        shows = np.isfinite(self._measured_m)
         # A family without a measured frame is represented by the average of the others.
         shares = np.bincount(drawn.families[np.isfinite(self._drawn_m)], minlength=int(drawn.families.max()) + 1)
         probes = np.bincount(families[shows], minlength=len(shares))

@@ -99,6 +99,12 @@ class RecipePlan:
         return drops / (drops + len(self.drawn.indices))
 
 
+def family_index(recipe: Recipe, scene_id: int) -> int:
+    """Place of a scene's family in the recipe, 0 without families."""
+    family = family_of_scene(recipe, scene_id)
+    return 0 if family is None else [one.name for one in recipe.families].index(family.name)
+
+
 def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan:
     """Count the pairs of a recipe, and draw some of its frames.
 

@@ -47,7 +47,6 @@ def plan_lines(
         ValueError: no such recipe or engine, a wrong number, or none of the first frames can be made.
         OSError: the page or the temporary folder cannot be written.
     """
-    from droguekit.batch.frame_cost import probe_cost
     from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
     if execution.workers is not None and (probes == 0 or execution.workers < 1):
@@ -58,7 +57,7 @@ def plan_lines(
     lines.append(f"a frame that is at work for {duration(frame_timeout_s(recipe))} counts as hung and is tried again")
     yield from lines
     if probes != 0:
-        costs = list(cost_lines(probe_cost(recipe, plan, execution.device, probes), execution.worker_count()))
+        costs = list(_probed_lines(recipe, plan, probes, execution))
         yield from costs
         lines += costs
     if html is not None:
@@ -66,6 +65,21 @@ def plan_lines(
 
         write_plan_page(recipe, plan, lines, html)
         yield f"wrote {html}"
+
+
+def _probed_lines(recipe: Recipe, plan: RecipePlan, probes: int | None, execution: ExecutionOptions) -> Iterator[str]:
+    """The lines of time and size, from frames that are rendered now, or were before on this machine."""
+    from droguekit.batch.frame_cost import estimate_cost, probe_recipe
+    from droguekit.batch.remembered_probes import remember_probe, remembered_probe
+
+    remembered = remembered_probe(recipe, execution.device) if probes is None else None
+    if remembered is None:
+        result = probe_recipe(recipe, plan, execution.device, probes)
+        remember_probe(recipe, execution.device, result)
+    else:
+        result = remembered.result
+    day = None if remembered is None else remembered.day
+    return cost_lines(estimate_cost(recipe, plan, result), execution.worker_count(), day)
 
 
 def _counts(recipe: Recipe, plan: RecipePlan) -> Iterator[str]:
@@ -148,11 +162,18 @@ def _verdict(check: LawCheck) -> str:
     )
 
 
-def cost_lines(cost: CostEstimate, workers: int) -> Iterator[str]:
-    """The estimated time and size of a run by so many workers, and the measurements behind it."""
+def cost_lines(cost: CostEstimate, workers: int, day: str | None = None) -> Iterator[str]:
+    """The estimated time and size of a run by so many workers, and the measurements behind it.
+
+    Args:
+        cost: the estimate.
+        workers: of the run.
+        day: of the measurements, or None where they were made just now.
+    """
     from droguekit.batch.frame_cost import cpu_s
 
-    yield "measured, with one worker, once it was warm:"
+    when = "" if day is None else f" on {day} (`--probe N` measures anew)"
+    yield f"measured{when}, with one worker, once it was warm:"
     for frame_index, report in cost.probed.items():
         where = "no drogue" if report.distance_m is None else f"{report.distance_m:.2f} m"
         size = human_size(report.size_bytes)
@@ -168,7 +189,9 @@ def cost_lines(cost: CostEstimate, workers: int) -> Iterator[str]:
     yield f"all pairs: {duration(work_s)} of processor time{scatter}"
     size = human_size(cost.size_bytes)
     yield f"all: about {duration(run_s)} with {workers} workers that have a core each, {size} without the records"
-    if cost.wall_over_cpu > _BUSY:
+    if cost.wall_over_cpu > _BUSY and day is not None:
+        yield "the machine was busy then: work may cost a quarter more than on an idle one"
+    elif cost.wall_over_cpu > _BUSY:
         yield (
             f"the machine is busy: a second of work took {cost.wall_over_cpu:.1f} s, and work may cost a quarter "
             f"more than on an idle one; if it stays so, the run takes about {duration(run_s * cost.wall_over_cpu)}"

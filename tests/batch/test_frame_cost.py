@@ -20,11 +20,13 @@ from droguekit.batch.frame_cost import (
     estimate_cost,
     fit_over_distance,
     make_in_turn,
-    probe_cost,
+    probe_recipe,
 )
 from droguekit.batch.frame_task import FrameReport, make_drop
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
+from droguekit.batch.remembered_probes import remember_probe, remembered_probe
 from droguekit.batch.worker_pool import WorkerLimits
+from droguekit.cli.main import DONE, run
 from droguekit.workflows.planning import cost_lines
 from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE
 from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, build_recipe
@@ -266,7 +268,7 @@ def test_every_worker_flies_every_sequence_once_and_a_new_process_the_one_it_com
 def test_the_probe_reckons_from_what_it_measures() -> None:
     recipe = parse_recipe(ANALYTIC_RECIPE)
     plan = plan_recipe(recipe)
-    found = probe_cost(recipe, plan)
+    found = estimate_cost(recipe, plan, probe_recipe(recipe, plan))
     order = np.argsort(plan.drawn.distances_m)
     assert {order[0], order[-1]} < set(found.probed)
     assert len(found.probed) == 3
@@ -279,18 +281,49 @@ def test_the_probe_reckons_from_what_it_measures() -> None:
     assert found.drops == ()
 
 
+def test_a_recipe_that_was_planned_before_is_not_probed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    recipe = parse_recipe(ANALYTIC_RECIPE)
+    assert remembered_probe(recipe, "cpu") is None
+    plan = plan_recipe(recipe)
+    result = probe_recipe(recipe, plan)
+    remember_probe(recipe, "cpu", result)
+    found = remembered_probe(recipe, "cpu")
+    assert found is not None and found.result == result
+    assert remembered_probe(recipe, "cuda") is None
+    assert remembered_probe(recipe.model_copy(update={"seed": recipe.seed + 1}), "cpu") is None
+
+    # Of another number of pairs, whose drawn frames are others, the same measurements tell as well.
+    more = recipe.model_copy(update={"frames": recipe.frames.model_copy(update={"count": 4000})})
+    again = remembered_probe(more, "cpu")
+    assert again is not None and again.result == result
+    few_s, many_s = (estimate_cost(each, plan_recipe(each), result).frames_s for each in (recipe, more))
+    assert many_s / few_s == pytest.approx(4000 / recipe.frames.count, rel=0.5)
+
+    file = tmp_path / "recipe.toml"
+    file.write_text(ANALYTIC_RECIPE)
+    monkeypatch.setattr("droguekit.batch.frame_cost.probe", pytest.fail)
+    assert run(["plan", str(file)]) == DONE
+    assert f"measured on {found.day} (`--probe N` measures anew), with one worker" in capsys.readouterr().out
+    for damaged in tmp_path.rglob("*.json"):
+        damaged.write_text(damaged.read_text()[:-20])
+    assert remembered_probe(recipe, "cpu") is None
+
+
 def test_a_frame_that_the_engine_refuses_is_a_drop_of_the_probe(troubled: Callable[..., Path]) -> None:
     recipe = parse_recipe(QUICK_RECIPE)
     plan = plan_recipe(recipe)
     order = choose_probe_frames(plan.drawn, 8)
     troubled(refuse=[order.warm_up[0], order.counted[1]])
-    found = probe_cost(recipe, plan)
+    found = estimate_cost(recipe, plan, probe_recipe(recipe, plan))
     assert [drop.frame_index for drop in found.drops] == [order.warm_up[0], order.counted[1]]
     assert found.drops[0].reason == f"frame {order.warm_up[0]} is beyond me"
     assert tuple(found.probed) == (order.counted[0], order.counted[2])
     troubled(refuse=list(range(8)))
     with pytest.raises(ValueError, match=r"none of 3 can be made, the last because: frame \d is beyond me"):
-        probe_cost(recipe, plan)
+        probe_recipe(recipe, plan)
 
 
 @pytest.mark.parametrize("workers", [1, 3])
