@@ -51,9 +51,9 @@ _DARKNESS_QUANTILE = 0.2
 _LARGEST_SIGMA_PX = 0.5
 # Tukey's biweight: sectors whose edge lies this many robust deviations off the ellipse do not move it.
 _OUTLIER_SIGMAS, _OUTLIER_FLOOR_PX = 4.5, 0.05
-# Levels of background, tube, inside and shading: a quarter of a pixel holds the tube's to that behind it.
+# Of the levels of background, tube, inside and shading: holds the tube's to that behind it.
 _TIE = np.array([[0.0, 0, 0, 0], [0, 1, -1, 0], [0, -1, 1, 0], [0, 0, 0, 0]])
-# Standard deviation of the light on the tube's flank over the contrast of the edge.
+# Standard deviations of the light on the tube's flank, and of the tube against what is behind it, over the contrast.
 _SHADING, _NO_FLANK, _NO_SHADING = 0.15, 1e-6, 1e12
 _TUBE_CONTRAST = 0.3
 # Levels and the edge's place.
@@ -349,10 +349,11 @@ def _sectors(
     tube_px = tube_fraction * ellipse.radius_px
     reach_px = _REACH_PX + 2 * blur_px
     count = max(24, round(2 * np.pi * ellipse.radius_px / _SECTOR_PX))
-    y, x = np.indices(light.shape)
+    x, y = _pixels_near(ellipse, reach_px, light.shape)
     depth, angle = ellipse.depths_and_angles(np.stack([x, y], axis=-1).astype(np.float64))
-    chosen = (depth > -reach_px) & (depth < reach_px) & (np.abs(depth) < ellipse.radius_px / 2)
-    depth, values, is_clipped = depth[chosen], light[chosen].astype(np.float64), clipped[chosen]
+    chosen = (np.abs(depth) < reach_px) & (np.abs(depth) < ellipse.radius_px / 2)
+    depth, x, y = depth[chosen], x[chosen], y[chosen]
+    values, is_clipped = light[y, x].astype(np.float64), clipped[y, x]
     sector = np.floor(angle[chosen] / (2 * np.pi) * count).astype(np.int64) % count
     angles = 2 * np.pi * (np.arange(count) + 0.5) / count
 
@@ -376,7 +377,9 @@ def _sectors(
         ridge = tie[:, None, None] * _TIE
         ridge[:, 3, 3] = stiffness
         normal = np.array([[total(a * b) for b in model.levels] for a in model.levels]).transpose(2, 0, 1)
-        inverse = np.linalg.inv(normal + ridge + 1e-9 * np.eye(4))
+        # Sectors without pixels, or all of one level, keep some solution.
+        least = 1e-9 * (np.einsum("sii->s", (normal + ridge)[:, :3, :3]) + 1)
+        inverse = np.linalg.inv(normal + ridge + least[:, None, None] * np.eye(4))
         levels = (inverse @ np.stack([total(a * values) for a in model.levels], -1)[..., None])[..., 0]
         rest = values - (levels[sector] * model.levels.T).sum(axis=1)
         slope = (levels[sector] * model.slopes.T).sum(axis=1)
@@ -399,6 +402,21 @@ def _sectors(
     inside = (levels * _profiles(np.full(count, _INSIDE_PX), tube_px, blur_px).levels.T).sum(axis=1)
     darkness = 1 - inside / np.maximum(levels[:, 0], 1e-9)
     return _Sectors(angles, shifts, np.where(is_edge, sigma, np.inf), darkness, typical_misfit)
+
+
+def _pixels_near(
+    ellipse: _Ellipse, reach_px: float, shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns and rows of all pixels within a distance of an ellipse, and of some beyond it."""
+    # Steps of two thirds of a pixel both ways leave none out.
+    longest_px = float(np.abs(np.linalg.eigvalsh(ellipse.shape_px)).max())
+    angle = np.linspace(0, 2 * np.pi, int(np.ceil(1.5 * 2 * np.pi * (longest_px + reach_px))), endpoint=False)
+    away = np.arange(-reach_px - 1, reach_px + 1.5, 2 / 3)
+    places = ellipse.points(angle)[:, None] + away[:, None] * ellipse.normals(angle)[:, None]
+    x, y = np.rint(places).astype(np.int64).reshape(-1, 2).T
+    inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    rows, columns = np.divmod(np.unique(y[inside] * shape[1] + x[inside]), shape[1])
+    return columns, rows
 
 
 @dataclass(frozen=True, eq=False)

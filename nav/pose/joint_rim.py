@@ -38,11 +38,11 @@ _SHIFT_INFORMATION = np.diag(EDGE_SHIFT_SD_PX**-2)
 _FREE_SHIFT_INFORMATION = np.diag(EDGE_SHIFT_SD_PX**-2 * [1e-6, 1, 1, 1, 1, 1])
 _PARAMETERS = 6 + len(EDGE_SHIFT_SD_PX)
 # Share of the circumference on which an edge must be seen, and on which it must agree with the rest, in each eye.
-_LEAST_SEEN, _LEAST_AGREEING = 0.6, 0.4
+_LEAST_SEEN, _LEAST_AGREEING = 0.6, 0.5
 _FEWEST_POINTS = 8
 # A rim that is lit has no edge of its own: its light, and that of the canopy behind it, move the edge by whole pixels.
 # Of drogues whose edge is at least this dark against the sky, errors are as stated.
-LEAST_DARKNESS = 0.75
+LEAST_DARKNESS = 0.8
 # Starts tilt by at least this much, so that there are two of them.
 _LEAST_START_RAD = np.radians(4.0)
 _STEPS, _SMALL_STEP_PX = 25, 1e-4
@@ -214,7 +214,8 @@ class _Problem:
         cost = self._cost(residuals - slopes[:, 6:] @ shift, shift, weights, pose, tilt_prior_rad)
         for _ in range(_STEPS):
             normal, gradient = self._equations(residuals, slopes, shift, weights, pose, tilt_prior_rad)
-            scale = 1 / np.sqrt(np.diag(normal))
+            # Where no point counts, nothing moves.
+            scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
             scaled = normal * np.outer(scale, scale) + damping * np.eye(_PARAMETERS)
             step = scale * np.linalg.solve(scaled, scale * gradient)
             trial, trial_shift = without_roll(_moved(pose, step[:6])), shift + step[6:]

@@ -21,10 +21,10 @@ from nav.pose.joint_rim import ROLL_SD_RAD
 from nav.tracking.region import rim_boxes
 from tests.support.painted_pairs import make_pose
 
-CAMERA = PinholeCamera(480, 360, 900.0, 900.0, 239.5, 179.5)
+CAMERA = PinholeCamera(320, 240, 640.0, 640.0, 159.5, 119.5)
 RIG = StereoRig(CAMERA, 0.12)
 BARE = DrogueParameters(name="bare", marker_positions_m=(), hub=None)
-POSE = make_pose(0.15, -0.1, 4.2, 9, -7, 25)
+POSE = make_pose(0.1, -0.08, 3.6, 9, -7, 25)
 
 
 def paint(rig: StereoRig, pose: RigidTransform, face_dn: float = 8.0, seed: int = 0) -> StereoImages:

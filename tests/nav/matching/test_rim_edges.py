@@ -117,6 +117,20 @@ def test_no_rim_gives_no_points() -> None:
     assert len(outside.eyes) == 0
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_pictures_of_anything_have_edges_with_numbers_or_none(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = np.full((SIZE_PX, SIZE_PX), rng.integers(0, 256), np.uint8)
+    for _ in range(12):
+        center, axes = rng.integers(20, 140, 2).tolist(), rng.integers(5, 60, 2).tolist()
+        cv2.ellipse(image, center, axes, float(rng.uniform(0, 180)), 0, 360, int(rng.integers(0, 256)), -1)
+    images = StereoImages(image, image[:, ::-1].copy(), time_s=0.0, exposure_s=1e-3)
+    edges = measure_rim(images, RIG, {"left": (40.0, 40.0, 80.0, 80.0), "right": (-20.0, 90.0, 75.0, 85.0)}, 0.02)
+    for numbers in (edges.points_px, edges.normals, edges.sigma_px, edges.darkness):
+        assert np.isfinite(numbers).all()
+    assert (edges.sigma_px > 0).all()
+
+
 def test_the_inner_edge_of_the_face_is_not_taken_for_the_rim() -> None:
     # The box is a seventh too small; the opening at 0.8 of the radius is nearer to it than the rim is.
     edges = measure(pair_of(draw()), -0.12)
