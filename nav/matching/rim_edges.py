@@ -9,6 +9,7 @@ sector, with the standard deviation that its pixels allow.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import cv2
 import numpy as np
@@ -56,6 +57,7 @@ _TIE = np.array([[0.0, 0, 0, 0], [0, 1, -1, 0], [0, -1, 1, 0], [0, 0, 0, 0]])
 # Standard deviations of the light on the tube's flank, and of the tube against what is behind it, over the contrast.
 _SHADING, _NO_FLANK, _NO_SHADING = 0.15, 1e-6, 1e12
 _TUBE_CONTRAST = 0.3
+_PAIRS = tuple(combinations_with_replacement(range(4), 2))
 # Levels and the edge's place.
 _PARAMETERS = 5
 
@@ -376,7 +378,9 @@ def _sectors(
         # Where the tube is too thin to tell, its level is that behind it; its shading is a share of the contrast.
         ridge = tie[:, None, None] * _TIE
         ridge[:, 3, 3] = stiffness
-        normal = np.array([[total(a * b) for b in model.levels] for a in model.levels]).transpose(2, 0, 1)
+        normal = np.empty((count, 4, 4))
+        for row, column in _PAIRS:
+            normal[:, row, column] = normal[:, column, row] = total(model.levels[row] * model.levels[column])
         # Sectors without pixels, or all of one level, keep some solution.
         least = 1e-9 * (np.einsum("sii->s", (normal + ridge)[:, :3, :3]) + 1)
         inverse = np.linalg.inv(normal + ridge + least[:, None, None] * np.eye(4))
