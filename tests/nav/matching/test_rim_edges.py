@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -115,6 +117,18 @@ def test_no_rim_gives_no_points() -> None:
     assert tiny.seen_fraction == (0.0, 0.0)
     outside = measure_rim(pair_of(draw()), RIG, {"left": (-300.0, 10.0, 90.0, 90.0)}, 0.04)
     assert len(outside.eyes) == 0
+
+
+@pytest.mark.parametrize("cut_px", [40, 55, 70])
+def test_a_rim_across_the_images_edge_has_the_rest_of_its_edge(cut_px: int) -> None:
+    whole = pair_of(draw())
+    cut = StereoImages(*(np.ascontiguousarray(eye[:, cut_px:]) for eye in (whole.left, whole.right)), 0.0, 1e-3)
+    center = CENTER_PX - (cut_px, 0)
+    edges = measure_rim(cut, RIG, dict.fromkeys(EYES, (*(center - 46), 92.0, 92.0)), 0.04)
+    assert 0.3 < min(edges.seen_fraction) <= max(edges.seen_fraction) < 1
+    moved = replace(edges, points_px=edges.points_px + np.array([cut_px, 0]))
+    # Another circle, as the face's opening, is brighter inside and so has no pose.
+    assert np.median(np.abs(distances_px(moved))) < 0.15 or max(edges.darkness) < 0
 
 
 @pytest.mark.parametrize("seed", range(6))
