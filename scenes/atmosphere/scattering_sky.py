@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.environment import Environment
 from scenes.air_light import LayeredAir, transmitted_share
 from scenes.atmosphere.air_layers import (
+    EARTH_M,
     MOLECULE_DEPTH_550,
     MOLECULES_AT_GROUND_PER_M,
     RGB_WEIGHTS,
@@ -226,7 +227,20 @@ class ScatteringAir(LayeredAir):
         for luminary in self._scattering.luminaries:
             air += luminary.before_ground(directions)
         clear = self._clear_to_ground(directions)
-        return sky, self._under_clouds(air + self._night_light * (1.0 - clear), clear)
+        return self._beyond_deck(sky, directions), self._under_clouds(air + self._night_light * (1.0 - clear), clear)
+
+    def _beyond_deck(self, sky: Radiance, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """The (..., 3) sky with the air up to the lowest clouds above the camera in their shade, as before clouds."""
+        above = [layer.height_above_camera_m for layer in self._environment.clouds if layer.is_above]
+        open_share, _ = self._under_deck
+        if not above or open_share == 1.0:
+            return sky
+        radius_m = EARTH_M + self._environment.altitude_m
+        up_m = radius_m * np.maximum(np.asarray(directions, dtype=np.float64)[..., 2], self.round_horizon_sine)
+        to_deck_m = np.sqrt(up_m * up_m + (2.0 * radius_m + min(above)) * min(above)) - up_m
+        lit, clear = self._lit_up_to(directions, to_deck_m.astype(np.float32))
+        result: Radiance = np.maximum(sky + self._under_clouds(lit, clear) - lit, np.float32(0.0))
+        return result
 
     def horizon_share(self, directions: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
         """(...) share of each pixel that lies below the horizon; pixels are `angle_rad` wide."""
@@ -280,12 +294,19 @@ class ScatteringAir(LayeredAir):
     def _up_to(
         self, directions: NDArray[np.floating[Any]], distance_m: NDArray[np.floating[Any]]
     ) -> tuple[Radiance, NDArray[np.float32]]:
+        lit, clear = self._lit_up_to(directions, distance_m)
+        return self._under_clouds(lit, clear), clear
+
+    def _lit_up_to(
+        self, directions: NDArray[np.floating[Any]], distance_m: NDArray[np.floating[Any]]
+    ) -> tuple[Radiance, NDArray[np.float32]]:
+        """As `_up_to`, under a clear sky."""
         seen = np.zeros(np.shape(directions), dtype=np.float32)
         clear = np.ones(np.shape(directions), dtype=np.float32)
         for luminary in self._scattering.luminaries:
             light, clear = luminary.up_to(directions, distance_m)
             seen += light
-        return self._under_clouds(seen + self._night_light * (1.0 - clear), clear), clear
+        return seen + self._night_light * (1.0 - clear), clear
 
     def _clear_to_ground(self, directions: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         tables = self._scattering.luminaries[0].tables

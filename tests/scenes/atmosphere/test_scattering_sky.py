@@ -256,6 +256,33 @@ def test_an_overcast_leaves_no_gap_above_the_ground() -> None:
     assert light.max() < 1.1 * np.median(light)
 
 
+@pytest.mark.parametrize("height_m", [500.0, 1500.0])
+def test_the_horizon_under_an_overcast_is_not_lit_by_the_sun_above_it(height_m: float) -> None:
+    """Air under a deck is in its shade: far away, where little of the deck is seen, no bright strip is left."""
+    deck = CloudLayer(
+        kind="stratus",
+        height_above_camera_m=height_m,
+        thickness_m=400.0,
+        cover_fraction=1.0,
+        optical_depth=40.0,
+        feature_size_m=2500.0,
+        texture_seed=1,
+    )
+    under = EnvironmentRadiance(environment(sun_elevation_deg=25.0, altitude_m=1000.0, clouds=(deck,)))
+    azimuths = np.radians(np.linspace(-40.0, 40.0, 81))
+    strips = []
+    for elevation_deg in (0.2, 15.0):
+        sine, cosine = np.sin(np.radians(elevation_deg)), np.cos(np.radians(elevation_deg))
+        row = np.stack([cosine * np.cos(azimuths), cosine * np.sin(azimuths), np.full(azimuths.shape, sine)], axis=-1)
+        strips.append(float(luminance(under.radiance(row[None].astype(np.float32))).mean()))
+    assert strips[0] < 1.7 * strips[1]
+    # Straight up there is little air under the deck: the sky in a gap is nearly that of a clear day.
+    up = np.array([[[0.0, 0.0, 1.0]]], dtype=np.float32)
+    open_sky = EnvironmentRadiance(environment(sun_elevation_deg=25.0, altitude_m=1000.0)).clear_radiance(up)[0]
+    share = under.clear_radiance(up)[0] / open_sky
+    assert 0.85 < share.min() and share.max() < 1.0
+
+
 def test_a_deck_below_ends_at_a_horizon_of_its_own() -> None:
     """1500 m below, a level deck of a round Earth is seen up to sqrt(2 h / R) = 1.24 degrees below level."""
     deck = CloudLayer(
