@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -32,6 +33,8 @@ from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 
+# Further keys of `[render]` by engine. Of Blender's edges, sampled as usual, the noise would be all that shows.
+ENGINES = {"analytic": "", "mitsuba": "", "blender": "samples_per_px = 64\nedge_samples_per_px = 1296\n"}
 FIRST_FRAME, FRAMES = 20, 3
 RECIPE = """
 name = "dense-matching"
@@ -159,10 +162,13 @@ def disparity_errors(dataset: Dataset, exported: Path) -> Iterator[dict[str, lis
             yield errors_px(pictures[number], pictures[1 - number], shift, matched)
 
 
-def main(out: Path) -> None:
+def main(
+    out: Path,
+    engines: Annotated[list[str] | None, typer.Option("--engine", help="only this one; may be repeated")] = None,
+) -> None:
     """Render, export and compare; prints a line for each engine and format."""
-    for engine in ("analytic", "mitsuba"):
-        text = f'{RECIPE}[render]\nengine = "{engine}"\n'
+    for engine in engines or ENGINES:
+        text = f'{RECIPE}[render]\nengine = "{engine}"\n{ENGINES[engine]}'
         folder, frames = out / engine, range(FIRST_FRAME, FIRST_FRAME + FRAMES)
         render_dataset(
             RecipeSource(parse_recipe(text), text), folder, frames, ExecutionOptions(1), PlainProgress(sys.stderr)
