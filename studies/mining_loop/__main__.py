@@ -63,7 +63,7 @@ def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
 
 
 def train_and_detect(
-    out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int, start: Path | None = None
+    out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int, start: str | None = None
 ) -> Path:
     """Train on corpora unless that is done, from given weights or from the start, and write the boxes in a dataset."""
     folder = out / "trainings" / f"{name}-{seed}"
@@ -79,6 +79,14 @@ def train_and_detect(
         droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
         found = folder / "detector.onnx"
         droguekit("detect", out / dataset, "--detector", found, "--out", boxes, log=log)
+    return boxes
+
+
+def detected(out: Path, detector: str, dataset: str) -> Path:
+    """Boxes of a shipped detector in a dataset, found unless they are there."""
+    boxes = out / f"{dataset}-{detector}.json"
+    if not boxes.is_file():
+        droguekit("detect", out / dataset, "--detector", detector, "--out", boxes, log=out / "mine.log")
     return boxes
 
 
@@ -144,6 +152,9 @@ def main(
     further_passes: Annotated[
         int | None, typer.Option("--further-passes", min=1, help="Train the first network on by so many, both ways.")
     ] = None,
+    start_from: Annotated[
+        str | None, typer.Option("--start-from", help="Mine with these weights, and train them on, both ways.")
+    ] = None,
     kept: Annotated[float, typer.Option("--kept", help="As of `droguekit mine`.")] = 0.3,
     test_pairs: Annotated[int, typer.Option("--test-pairs", min=2, help="Pairs of the test set.")] = 600,
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
@@ -152,27 +163,37 @@ def main(
     try:
         out.mkdir(parents=True, exist_ok=True)
         make_corpora(out, test_pairs, workers)
-        trial = train_and_detect(out, "first", ["first"], "trial", image_passes, 0)
-        mined, log = out / "mined.toml", out / "mine.log"
+        name = f"mined-{round(100 * kept)}" if start_from is None else f"mined-{round(100 * kept)}-{start_from}"
+        arms = {"even": "even", "mined": name}
+        mined, log = out / f"{name}.toml", out / "mine.log"
+        if start_from is None:
+            trial = train_and_detect(out, "first", ["first"], "trial", image_passes, 0)
+        else:
+            trial = detected(out, start_from, "trial")
         droguekit("mine", out / "trial", "--detections", trial, "--kept", kept, "--count", 150, "--out", mined, log=log)
         # As many scenes as the even corpus has: scenes teach more than pairs of one scene.
         asked = re.sub(r"(?m)^scenes = \d+", "scenes = 75", mined.read_text(encoding="utf-8"))
         write_text_atomic(mined, asked)
-        droguekit("render", mined, "--out", out / "mined", "--workers", workers, log=out / "render.log")
+        droguekit("render", mined, "--out", out / name, "--workers", workers, log=out / "render.log")
         scores: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
         whole: dict[str, list[float]] = {arm: [] for arm in ARMS}
         truth = read_detection_truth(out / "test")
         for seed in range(1, seeds + 1):
-            for arm in ARMS:
-                name, passes, start = arm, image_passes, None
-                if further_passes is not None:
-                    name, passes = f"{arm}-further", further_passes
-                    start = trial.with_name("best.pt")
-                boxes = train_and_detect(out, name, ["first", arm], "test", passes, seed, start)
+            for arm, corpus in arms.items():
+                name, passes, start = corpus, image_passes, None
+                if start_from is not None:
+                    name, start = f"{arm}-from-{start_from}", start_from
+                elif further_passes is not None:
+                    name, passes = f"{corpus}-further", further_passes
+                    start = str(trial.with_name("best.pt"))
+                boxes = train_and_detect(out, name, ["first", corpus], "test", passes, seed, start)
                 scores[arm].append(cell_scores(out / "test", boxes))
                 evaluation = Evaluation(truth.images, read_boxes(truth.images, boxes))
                 ap50 = evaluation.average_precision(truth.images).ap50
                 whole[arm].append(100.0 * (ap50 or 0.0))
+        if start_from is not None:
+            before = cell_scores(out / "test", detected(out, start_from, "test"))
+            typer.echo(f"{start_from} as it is: " + ", ".join(f"{cell} {ap50:.1f}" for cell, ap50 in before.items()))
         write_text_atomic(out / "scores.json", json.dumps({"cells": scores, "all": whole}, indent=1) + "\n")
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
