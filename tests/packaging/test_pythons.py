@@ -7,12 +7,14 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
@@ -48,6 +50,19 @@ def test_classifiers_and_required_python_name_the_same_versions() -> None:
 def test_set_up_takes_these_versions_the_newest_first() -> None:
     (named,) = re.findall(r'^pythons="(.*)"$', setup_text(), re.MULTILINE)
     assert tuple(named.split()) == PYTHONS[::-1]
+
+
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="what is installed here is not of constraints.txt")
+def test_what_is_pinned_for_3_11_runs_on_the_one_of_debian_12() -> None:
+    """Its Python is 3.11.2, and some packages ask for later ones."""
+    pinned = constraints("3.11")
+    asked = {
+        each.name: each.metadata["Requires-Python"]
+        for each in distributions()
+        if canonicalize_name(each.name) in pinned and each.metadata["Requires-Python"] is not None
+    }
+    assert len(asked) > 50
+    assert {name: text for name, text in asked.items() if "3.11.2" not in SpecifierSet(text)} == {}
 
 
 @pytest.mark.parametrize("python", PYTHONS)
