@@ -25,7 +25,7 @@ from droguekit.workflows.rendering import MOST_TIMEOUT_S
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
 from nav.pair_navigator import BINARY_METHODS, RIM_METHODS
-from nav.pose.method_registry import ENTRY_POINT_GROUP
+from nav.pose.method_registry import ENTRY_POINT_GROUP, METHODS
 from nav.pose.pose_method import Observation, Solution
 from nav.runner import method_names
 
@@ -179,6 +179,11 @@ def test_methods_and_drogues_that_ship_are_documented() -> None:
 def test_commands_that_ship_are_documented() -> None:
     page = text("docs/reference/commands.md")
     assert [name for name in COMMANDS if f"| `{name}` |" not in page] == []
+
+
+def test_the_readme_counts_the_methods() -> None:
+    (count,) = re.findall(r"The (\d+) methods that ship", text("README.md"))
+    assert int(count) == len(METHODS)
 
 
 def test_readme_is_short() -> None:
