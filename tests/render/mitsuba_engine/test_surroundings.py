@@ -13,7 +13,7 @@ import trimesh
 from datasets_manifest.recipe.recipe import RenderSettings, load_recipe
 from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.obstacles import ObstacleShape
+from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
@@ -69,7 +69,10 @@ def test_edges_cover_what_they_should(engine: RenderEngine) -> None:
     assert len(error) > 200
     # Four random rays leave 0.15, sixteen stratified ones a third of it.
     assert np.sqrt(np.mean(error**2)) < 0.08
-    assert np.mean(error) == pytest.approx(0.0, abs=0.01)
+    # The rod's mesh has flat sides, whose silhouette lies up to so much inside the circle's. [px]
+    radius_px = frame.rig.camera.fx_px * 0.5 / 10.0
+    inside_px, scatter = radius_px * (1.0 - np.cos(np.pi / OBSTACLE_SECTIONS)), 3.0 * error.std() / np.sqrt(len(error))
+    assert -inside_px - scatter < np.mean(error) < scatter
 
 
 def test_a_rod_thinner_than_a_pixel_has_no_gaps(engine: RenderEngine) -> None:
