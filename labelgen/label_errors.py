@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.records import FeatureView, PairRecord
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_image_centers
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import Array
 from geometry.stereo import Eye
 from labelgen.disc_images import DiscInEye, marker_discs
 from labelgen.part_pixels import FeaturePixels, drogue_box
@@ -71,26 +71,32 @@ def label_errors(record: PairRecord, eye: Eye) -> LabelErrors | None:
     if drogue is None or pose is None:
         return None
     rig, layout = record.frame.rig, marker_layout(drogue)
+    view = record.views.left if eye == "left" else record.views.right
     ends = record.left_from_drogue_open or pose, record.left_from_drogue_close or pose
-
-    def bent_px(centers_m: Array, radii_m: Array) -> tuple[float, ...]:
-        begun, middle, ended = (disc_image_centers(rig, at, centers_m, radii_m, eye) for at in (ends[0], pose, ends[1]))
-        mean_shift = np.linalg.norm(begun - 2.0 * middle + ended, axis=-1) / 6.0
-        return tuple((mean_shift + ARITHMETIC_PX).tolist())
-
-    hub = None
-    if layout.hub_center_m is not None:
-        hub = bent_px(layout.hub_center_m[None], np.array([layout.hub_outer_radius_m]))[0]
-    moved = np.max([np.abs(_sides(record, at, eye) - _sides(record, pose, eye)) for at in ends], axis=0)
+    centers_m, radii_m = layout.centers_m, np.full(layout.count, layout.radius_m)
+    features: list[FeatureView] = list(view.markers)
+    if layout.hub_center_m is not None and view.hub is not None:
+        centers_m = np.vstack([centers_m, layout.hub_center_m])
+        radii_m = np.append(radii_m, layout.hub_outer_radius_m)
+        features.append(view.hub)
+    bent = np.zeros(0)
+    if features:
+        middle = np.array([feature.center_ellipse_px for feature in features])
+        begun, ended = (disc_image_centers(rig, at, centers_m, radii_m, eye) for at in ends)
+        bent = np.linalg.norm(begun - 2.0 * middle + ended, axis=-1) / 6.0 + ARITHMETIC_PX
+    moved = np.zeros(4)
+    if view.box_full_xywh_px is not None:
+        middle = _sides(view.box_full_xywh_px)
+        moved = np.max([np.abs(_sides(drogue_box(drogue, rig, at, eye)) - middle) for at in ends], axis=0)
     full, visible = (moved + least for least in (ARITHMETIC_PX, 0.5))
-    markers = bent_px(layout.centers_m, np.full(layout.count, layout.radius_m)) if layout.count else ()
-    return LabelErrors(markers, hub, _four(full), _four(visible))
+    count = len(view.markers)
+    hub = float(bent[count]) if len(features) > count else None
+    return LabelErrors(tuple(bent[:count].tolist()), hub, _four(full), _four(visible))
 
 
-def _sides(record: PairRecord, pose: RigidTransform, eye: Eye) -> Array:
-    """(4,) left, upper, right and lower side of the drogue's box at a pose. [px]"""
-    assert record.frame.drogue is not None
-    u, v, width, height = drogue_box(record.frame.drogue, record.frame.rig, pose, eye)
+def _sides(box: PixelBox) -> Array:
+    """(4,) left, upper, right and lower side. [px]"""
+    u, v, width, height = box
     return np.array([u, v, u + width, v + height])
 
 

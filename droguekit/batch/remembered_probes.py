@@ -44,10 +44,14 @@ _ADAPTER = TypeAdapter(RememberedProbe)
 def remembered_probe(recipe: Recipe, device: Device) -> RememberedProbe | None:
     """What this machine measured of the recipe before with the same software, or None.
 
-    The number of pairs and the splits may differ: a frame is the same frame in all of them.
+    The number of pairs and the splits may differ: a frame is the same frame in all of them. What was measured of a
+    larger recipe tells nothing where it names frames that this one has not.
     """
     with suppress(OSError, ValueError):
-        return _ADAPTER.validate_json(read_text(_file(recipe, device), _MOST_BYTES))
+        found = _ADAPTER.validate_json(read_text(_file(recipe, device), _MOST_BYTES))
+        result = found.result
+        frames = [*result.warm_up, *result.counted, *(drop.frame_index for drop in result.drops)]
+        return found if max(frames) < recipe.frames.count else None
     return None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drogue_models.marker_layout import RimOutline
-from geometry.se3 import Array, RigidTransform, skew
+from geometry.se3 import Array, RigidTransform, exp_rotation, skew
 from geometry.stereo import EYES, StereoRig
 from nav.pose.joint import (
     RELIABLE_SIGMAS,
@@ -218,7 +218,8 @@ class _Problem:
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
             scaled = normal * np.outer(scale, scale) + damping * np.eye(_PARAMETERS)
             step = scale * np.linalg.solve(scaled, scale * gradient)
-            trial, trial_shift = without_roll(_moved(pose, step[:6])), shift + step[6:]
+            turned = exp_rotation(step[3:6]) @ pose.rotation
+            trial, trial_shift = without_roll(RigidTransform(turned, pose.translation_m + step[:3])), shift + step[6:]
             moved_px = float(np.abs(slopes[:, :6] @ step[:6]).max())
             if not (trial.translation_m[2] > 2 * self.rim.radius_m and trial.rotation[2, 2] > 0.2):
                 damping *= 10
@@ -359,16 +360,6 @@ def _facing_points_m(rim: RimOutline, pose: RigidTransform, angles: Array, eyes_
     side *= np.sign((side * out).sum(axis=1))[:, None] / np.linalg.norm(side, axis=1, keepdims=True)
     points: Array = line + tube_m * side
     return points
-
-
-def _moved(pose: RigidTransform, step: Array) -> RigidTransform:
-    """The pose after (6,) dt and w, for small w to second order by a rotation."""
-    angle = float(np.linalg.norm(step[3:]))
-    if angle < 1e-15:
-        return RigidTransform(pose.rotation, pose.translation_m + step[:3])
-    axis = skew(step[3:] / angle)
-    turn = np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
-    return RigidTransform(turn @ pose.rotation, pose.translation_m + step[:3])
 
 
 def without_roll(pose: RigidTransform) -> RigidTransform:

@@ -167,6 +167,8 @@ def main(
     engines: Annotated[list[str] | None, typer.Option("--engine", help="only this one; may be repeated")] = None,
 ) -> None:
     """Render, export and compare; prints a line for each engine and format."""
+    if unknown := set(engines or ()) - set(ENGINES):
+        raise typer.BadParameter(f"--engine: must be one of {', '.join(ENGINES)}, got {min(unknown)}")
     for engine in engines or ENGINES:
         text = f'{RECIPE}[render]\nengine = "{engine}"\n{ENGINES[engine]}'
         folder, frames = out / engine, range(FIRST_FRAME, FIRST_FRAME + FRAMES)

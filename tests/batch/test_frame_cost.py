@@ -302,6 +302,9 @@ def test_a_recipe_that_was_planned_before_is_not_probed_again(
     few_s, many_s = (estimate_cost(each, plan_recipe(each), result).frames_s for each in (recipe, more))
     assert many_s / few_s == pytest.approx(4000 / recipe.frames.count, rel=0.5)
 
+    fewer = recipe.model_copy(update={"frames": recipe.frames.model_copy(update={"count": max(result.counted)})})
+    assert remembered_probe(fewer, "cpu") is None
+
     file = tmp_path / "recipe.toml"
     file.write_text(ANALYTIC_RECIPE)
     monkeypatch.setattr("droguekit.batch.frame_cost.probe", pytest.fail)

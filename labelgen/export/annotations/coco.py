@@ -134,6 +134,7 @@ def _write(
                 annotations = [] if drogue is None else [drogue]
                 if with_features and part_id is not None:
                     annotations += coco_features(record, eye, part_id, count)
+                _add_error_limits(annotations, record, eye, part_id if with_features else None)
                 objects = len(annotations)
                 annotations += coco_neighbours(record, eye, part_id, count)
                 image = coco_image(record, eye, split)
@@ -321,7 +322,6 @@ def coco_annotation(
         "num_keypoints": sum(point.flag > 0 for point in points),
         NAMESPACE: {
             "bbox_full": _corner_box(view.box_full_xywh_px),
-            **_error_limits(record, eye),
             "truncated": view.truncated,
             **({"sought": True} if record.frame.neighbours else {}),
             "drogue": drogue.name,
@@ -338,15 +338,31 @@ def coco_annotation(
     }
 
 
-def _error_limits(record: PairRecord, eye: Eye) -> dict[str, Any]:
-    """Limits on the errors of both boxes' sides and of the markers' centres, by key."""
-    limits = label_errors(record, eye)
-    assert limits is not None
-    return {
-        "bbox_error_px": list(limits.box_visible_px),
-        "bbox_full_error_px": list(limits.box_full_px),
-        "center_error_px": list(limits.markers_px),
-    }
+def _add_error_limits(
+    annotations: list[dict[str, Any]], record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None
+) -> None:
+    """Add limits on the errors of boxes and centres to the entries of one eye's drogue, markers and hub, in place.
+
+    Args:
+        annotations: the drogue's first; may be empty.
+        record, eye: which view.
+        part_id: (H, W) its part ids, by which markers are confirmed, or None.
+    """
+    limits = label_errors(record, eye) if annotations else None
+    if limits is None:
+        return
+    confirmed = () if part_id is None else confirmed_px(record, eye, part_id)
+    for entry in annotations:
+        own = entry[NAMESPACE]
+        if entry["category_id"] == DROGUE:
+            own["bbox_error_px"] = list(limits.box_visible_px)
+            own["bbox_full_error_px"] = list(limits.box_full_px)
+            own["center_error_px"] = list(limits.markers_px)
+        elif entry["category_id"] == HUB:
+            own["center_error_px"] = limits.hub_px
+        else:
+            index = own["marker_index"]
+            own["center_error_px"], own["center_confirmed_px"] = limits.markers_px[index], confirmed[index]
 
 
 def coco_neighbours(
@@ -432,8 +448,6 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
     if view.box_visible_xywh_px is None:
         return []
     image_id, entries = _small_image_id(record, eye), []
-    limits, confirmed = label_errors(record, eye), confirmed_px(record, eye, part_id)
-    assert limits is not None
     for seen in drogue_pixels(record, eye, part_id).features(view):
         feature, index = seen.feature, seen.marker_index
         entries.append(
@@ -452,8 +466,6 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
                     "marker_index": index,
                     "center_proj": _corner_point(feature.center_proj_px),
                     "center_ellipse": _corner_point(feature.center_ellipse_px),
-                    "center_error_px": limits.hub_px if index is None else limits.markers_px[index],
-                    **({} if index is None else {"center_confirmed_px": confirmed[index]}),
                     "visible_fraction": feature.visible_fraction,
                     "in_image": feature.in_image,
                     "signal_to_noise": feature.signal_to_noise,
