@@ -341,13 +341,7 @@ def coco_annotation(
 def _add_error_limits(
     annotations: list[dict[str, Any]], record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None
 ) -> None:
-    """Add limits on the errors of boxes and centres to the entries of one eye's drogue, markers and hub, in place.
-
-    Args:
-        annotations: the drogue's first; may be empty.
-        record, eye: which view.
-        part_id: (H, W) its part ids, by which markers are confirmed, or None.
-    """
+    """Add limits of errors to the entries of one eye's drogue, and of its markers and hub where part ids are given."""
     limits = label_errors(record, eye) if annotations else None
     if limits is None:
         return
