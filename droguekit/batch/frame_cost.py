@@ -9,7 +9,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -24,13 +24,13 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import Drop
 from datasets_manifest.storage.reader import read_record_table
-from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop
+from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop, process_engine, render_frame
 from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan, family_index
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array
 from render.device import Device
 from render.engine import has_compiled
-from scenes.sampler import sample_frame, scene_of_frame
+from scenes.sampler import scene_of_frame
 
 PROBES = 5
 """Measured frames with a drogue at most, unless another number is asked for."""
@@ -45,8 +45,8 @@ _MOST_WARM_UP = 2
 _LONG_WARM_UP_S = 2.0
 # Constant, inverse and inverse square of the distance.
 _TERMS = 3
-# The stage that makes a scene's environment; every process does it once for each of its scenes.
-_SCENE_STAGE = "sample"
+# The stages that make a scene's sky, ground and objects, most of it once for all its frames, which are made in a row.
+_SCENE_STAGES = ("sample", "sky", "scene")
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class ProbeResult:
     Attributes:
         warm_up: frames made before the others.
         counted: frames from which the cost is estimated.
-        drawn_again_s: processor time of drawing the last frame a second time, when its environment exists. [s]
+        later_scene_s: processor time of a frame in the stages that make its scene, when the scene exists. [s]
         start_cpu_s: processor time of the process outside the frames. [s]
         drops: frames that cannot be made, and why.
     """
 
     warm_up: dict[int, FrameReport]
     counted: dict[int, FrameReport]
-    drawn_again_s: float
+    later_scene_s: float
     start_cpu_s: float
     drops: tuple[Drop, ...]
 
@@ -157,11 +157,12 @@ def _probe(recipe: Recipe, frames: ProbeFrames, device: Device) -> ProbeResult:
         if not counted:
             raise ValueError(f"frames: none of {len(frames.counted)} can be made, the last because: {drops[-1].reason}")
     began_s = time.process_time()
-    sample_frame(recipe, next(reversed(counted)))
-    drawn_again_s = time.process_time() - began_s
+    quickest = min(counted, key=lambda index: cpu_s(counted[index]))
+    again = render_frame(recipe, quickest, process_engine(recipe.render.engine, device))
+    again_s = time.process_time() - began_s
     in_frames_s = sum(cpu_s(report) for report in [*warm_up.values(), *counted.values()])
-    start_s = time.process_time() - in_frames_s - failed_s - more_failed_s - drawn_again_s
-    return ProbeResult(warm_up, counted, drawn_again_s, max(0.0, start_s), tuple(drops))
+    start_s = time.process_time() - in_frames_s - failed_s - more_failed_s - again_s
+    return ProbeResult(warm_up, counted, _in_scene_stages_s(again.stage_s), max(0.0, start_s), tuple(drops))
 
 
 def make_in_turn(
@@ -209,8 +210,8 @@ class CostEstimate:
         probed: the measured frames by index.
         drops: frames that were to be measured and cannot be made, and why.
         start_s: until a worker process is ready for its first frame. [s]
-        scene_s: for a process to make the environment of a scene, or to simulate the flight of a sequence. [s]
-        frames_s: for all pairs, without making their environments. [s]
+        scene_s: for a process to make a scene, or to simulate the flight of a sequence. [s]
+        frames_s: for all pairs, without making their scenes. [s]
         error_s: standard error of `frames_s`, or None where too few frames were measured. [s]
         wall_over_cpu: wall time per processor time: 1 on an idle machine, more on a busy one or where the engine waits
             for another device.
@@ -232,9 +233,9 @@ class CostEstimate:
 
     def work_s(self, workers: int) -> float:
         """Processor time of all frames of a run, without starting its processes. [s]"""
-        processes, workers = self._processes(workers), max(1, min(workers, self.count))
-        # Single pairs cycle through the scenes, so every process meets all; sequences follow one another.
-        visits = processes * self.scenes if self.sequences == 0 else self.sequences * workers + processes - workers
+        # A process stays at a scene or a sequence until its pairs are made. The last ones are shared, and a process
+        # that replaces another begins where that one stopped.
+        visits = (self.sequences or self.scenes) + self._processes(workers) - 1
         return min(self.count, visits) * self.scene_s + self.frames_s
 
     def run_s(self, workers: int) -> float:
@@ -267,9 +268,9 @@ def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> Cost
     every = [*probed.warm_up.values(), *reports]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
     fit = _DistanceFit(recipe, plan.drawn, probed.counted)
-    # Every pair takes in this stage what one takes whose environment exists already.
-    rest_s = [cpu_s(report) - _scene_stage_s(report) for report in reports]
-    frames_s, error_s = fit.total([seconds + probed.drawn_again_s for seconds in rest_s], count)
+    # Every pair takes in these stages what one takes whose scene exists already.
+    rest_s = [cpu_s(report) - _in_scene_stages_s(report.stage_s) for report in reports]
+    frames_s, error_s = fit.total([seconds + probed.later_scene_s for seconds in rest_s], count)
     return CostEstimate(
         probed=probed.counted,
         drops=probed.drops,
@@ -322,14 +323,14 @@ def _scene_s(recipe: Recipe, probed: ProbeResult) -> float:
     for frame_index, report in (probed.warm_up | probed.counted).items():
         length = None if recipe.sequence is None else recipe.sequence.frames_per_sequence
         unit = scene_of_frame(recipe, frame_index) if length is None else frame_index // length
-        first_s.setdefault(unit, _scene_stage_s(report))
+        first_s.setdefault(unit, _in_scene_stages_s(report.stage_s))
     # The very first frame also makes tables that all scenes share.
     later_s = list(first_s.values())[1:] or list(first_s.values())
-    return max(0.0, float(np.mean(later_s)) - probed.drawn_again_s)
+    return max(0.0, float(np.mean(later_s)) - probed.later_scene_s)
 
 
-def _scene_stage_s(report: FrameReport) -> float:
-    return report.stage_s.get(_SCENE_STAGE, 0.0)
+def _in_scene_stages_s(stage_s: Mapping[str, float]) -> float:
+    return sum(stage_s.get(stage, 0.0) for stage in _SCENE_STAGES)
 
 
 def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike, weights: ArrayLike = 1.0) -> Array:

@@ -8,6 +8,7 @@ from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, NamedTuple, TextIO
 
 from datasets_manifest.calibration.calibration_files import write_calibration
@@ -36,7 +37,7 @@ from droguekit.batch.worker_pool import (
 from labelgen.export.annotations.coco import write_annotations
 from render.engine import crash_advice, engine_notice, has_compiled
 from render.version import RENDER_VERSION
-from scenes.sampler import split_of_scenes
+from scenes.sampler import scene_of_frame, split_of_scenes
 
 # With so many pairs, a step of milliseconds a pair takes long enough to be announced.
 _MANY_PAIRS = 1000
@@ -107,7 +108,8 @@ def make_frames(
 
     Args:
         task: makes a frame.
-        todo: indices of the frames, each once, in the order in which they start.
+        todo: indices of the frames, each once. Worker processes take them by `unit_of_frame`, a Dask scheduler in
+            this order.
         options: who makes them.
         report: is told of the progress.
         events: gets every attempt.
@@ -187,7 +189,17 @@ def _attempts(
     share_gib = available_memory_gib() / max(workers, 1)
     is_cold = not has_compiled(task.recipe.render.engine, options.device)
     limits = WorkerLimits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib), is_first_alone=is_cold)
-    return run_tasks(task, todo, workers, limits, stop, task.pack)
+    return run_tasks(task, todo, workers, limits, stop, task.pack, partial(unit_of_frame, task.recipe))
+
+
+def unit_of_frame(recipe: Recipe, frame_index: int) -> int:
+    """Number of the sequence of a frame, or of the scene of a single one.
+
+    What its frames share is made once for all that a process makes in a row: flight, sky, ground and objects.
+    """
+    if recipe.sequence is not None:
+        return frame_index // recipe.sequence.frames_per_sequence
+    return scene_of_frame(recipe, frame_index)
 
 
 def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, dropped: int, run: RunSize) -> str:
@@ -249,7 +261,7 @@ def render_dataset(
     Args:
         source: the recipe; its text is kept in the dataset.
         out: place of the dataset: a folder, or a URL that all workers can reach.
-        frames: indices of the frames to make, in that order.
+        frames: indices of the frames to make.
         options: who makes them; a number means that many worker processes of this machine.
         report: is told of the progress.
 

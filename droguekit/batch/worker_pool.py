@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 import traceback
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ from typing import Any, Generic, Self, TypeVar, cast
 
 from datasets_manifest.atomic import remove_scratch_folders
 from droguekit.batch.execution import resident_gib
+from droguekit.batch.task_queue import TaskQueue
 from droguekit.numerical_threads import one_thread_in_new_processes
 
 # A cluster asks a job to end with SIGTERM.
@@ -144,6 +145,7 @@ class Worker:
         with suppress(OSError):
             self.connection.send((function, then))
         self.index: int | None = None
+        self.group: int | None = None
         self.is_ready = False
         self.tasks_done = 0
         self.resident_gib = 0.0
@@ -327,6 +329,7 @@ def run_tasks(
     limits: WorkerLimits | None = None,
     stop: StopRequest | None = None,
     then: Callable[[int, T], T] | None = None,
+    group_of: Callable[[int], int] | None = None,
 ) -> Generator[TaskAttempt[T], None, None]:
     """Run `function(index)` for every index in worker processes, and report each attempt as it ends.
 
@@ -340,16 +343,20 @@ def run_tasks(
         limits: of each worker.
         stop: once it is requested, no more tasks start, and the iterator ends after the running ones.
         then: runs after a task in the same process without time limit; turns index and value into what is reported.
+        group_of: number of the group of each task. A process does the tasks of a group one after the other, because
+            they share what is made once for the first; None keeps the order of the indices.
 
     Raises:
         OSError: worker processes cannot be started.
     """
+    waiting = TaskQueue(indices, group_of)
     if workers == 0:
-        for index in indices:
-            if stop is None or not stop.is_requested:
-                yield _attempt_here(function, then, index)
+        group = None
+        while waiting and not (stop is not None and stop.is_requested):
+            index, group = waiting.take(group)
+            yield _attempt_here(function, then, index)
         return
-    pool = _WorkerPool[T](partial(Worker, function, then), deque(indices), workers, limits or WorkerLimits())
+    pool = _WorkerPool[T](partial(Worker, function, then), waiting, workers, limits or WorkerLimits())
     try:
         while pool.fill(stop is not None and stop.is_requested):
             yield from pool.attempts(stop)
@@ -368,7 +375,7 @@ def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | No
 class _WorkerPool(Generic[T]):
     """The workers of a run, the waiting tasks, and how often each task has failed."""
 
-    def __init__(self, start: Callable[[], Worker], waiting: deque[int], size: int, limits: WorkerLimits) -> None:
+    def __init__(self, start: Callable[[], Worker], waiting: TaskQueue, size: int, limits: WorkerLimits) -> None:
         self._start, self._waiting, self._size, self._limits = start, waiting, size, limits
         self._workers: list[Worker] = []
         self._failures: Counter[int] = Counter()
@@ -376,7 +383,7 @@ class _WorkerPool(Generic[T]):
         self._deaths_at_start = 0
 
     def fill(self, stopping: bool) -> bool:
-        """Give idle workers tasks, and start missing workers.
+        """Give idle workers tasks, each of the group that it is at while there are any, and start missing workers.
 
         Returns:
             Whether any task waits or runs.
@@ -385,7 +392,9 @@ class _WorkerPool(Generic[T]):
             self._waiting.clear()
         for worker in [worker for worker in self._workers if worker.is_ready and worker.index is None]:
             if self._waiting:
-                worker.assign(self._waiting.popleft())
+                held = {other.group for other in self._workers if other is not worker and other.group is not None}
+                index, worker.group = self._waiting.take(worker.group, held)
+                worker.assign(index)
         starting = sum(not worker.is_ready for worker in self._workers)
         size = self._size if self._may_share else 1
         for _ in range(min(size - len(self._workers), len(self._waiting) - starting)):
@@ -452,7 +461,7 @@ class _WorkerPool(Generic[T]):
         self._failures[index] += 1
         final = self._failures[index] >= MAX_ATTEMPTS
         if not final:
-            self._waiting.append(index)
+            self._waiting.add(index)
         self._may_share = self._may_share or final
         return TaskAttempt(index, self._failures[index], None, error, final, self._resident_gib(), output)
 

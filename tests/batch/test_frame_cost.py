@@ -128,30 +128,35 @@ def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
 
 
 def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], first_s: float = 0.0) -> ProbeResult:
-    """A probe in which a frame takes `rest_s` and 0.2 s of sampling, and `first_s` more in a new scene."""
+    """A probe in which a frame takes `rest_s` and 0.2 s to set up its scene, and `first_s` more to make a new one."""
     drawn, met = plan.drawn, set[int]()
 
     def report(index: int) -> FrameReport:
         place = drawn.indices.index(index)
         scene_id, distance_m = int(drawn.scenes[place]), float(drawn.distances_m[place])
-        sample_s = 0.2 + (first_s if scene_id not in met else 0.0)
+        new_s = first_s if scene_id not in met else 0.0
         met.add(scene_id)
-        stage_s = {"sample": sample_s, "paths": rest_s(index)}
+        stage_s = {
+            "sample": 0.1 + new_s / 2,
+            "sky": 0.05 + new_s / 4,
+            "scene": 0.05 + new_s / 4,
+            "paths": rest_s(index),
+        }
         return FrameReport("here", sum(stage_s.values()), stage_s, None if np.isnan(distance_m) else distance_m, 1000)
 
     order = choose_probe_frames(drawn, recipe.frames.count)
     warm_up = {index: report(index) for index in order.warm_up}
     counted = {index: report(index) for index in order.counted}
-    return ProbeResult(warm_up, counted, report(order.counted[-1]).stage_s["sample"], 3.0, ())
+    return ProbeResult(warm_up, counted, 0.2, 3.0, ())
 
 
-def test_drawing_a_frame_counts_for_every_pair_and_a_new_scene_once() -> None:
+def test_setting_up_a_scene_counts_for_every_pair_and_making_it_once() -> None:
     recipe = build_recipe(BASE)
     plan = plan_recipe(recipe)
     found = estimate_cost(recipe, plan, synthetic(recipe, plan, lambda _: 1.0, first_s=0.7))
     assert found.frames_s == pytest.approx(200 * (1.0 + 0.2), rel=1e-9)  # float64 least squares
     assert found.scene_s == pytest.approx(0.7, rel=1e-9)
-    # One process in which each of ten scenes is met.
+    # One process makes each of ten scenes once.
     assert found.work_s(1) == pytest.approx(200 * 1.2 + 10 * 0.7, rel=1e-9)
 
 
@@ -250,18 +255,13 @@ def cost(count: int, scenes: int, sequences: int = 0) -> CostEstimate:
     )
 
 
-def test_time_counts_starts_and_scenes_of_every_process() -> None:
-    # Five processes, each of which meets 60 scenes.
-    count = 5 * WorkerLimits().tasks_per_process
-    assert cost(count, 60).work_s(2) == 5 * 60 * 0.5 + 1000
-    assert cost(count, 60).run_s(2) == (5 * 10 + 5 * 60 * 0.5 + 1000) / 2
-    # With twenty workers a hundred pairs are five for each, so that no more than a hundred scenes are met.
-    assert cost(100, 60).run_s(20) == (20 * 10 + 100 * 0.5 + 1000) / 20
-
-
-def test_every_worker_flies_every_sequence_once_and_a_new_process_the_one_it_comes_to() -> None:
-    count = 5 * WorkerLimits().tasks_per_process
-    assert cost(count, 1, sequences=4).work_s(2) == (4 * 2 + 5 - 2) * 0.5 + 1000
+@pytest.mark.parametrize("sequences", [0, 60])
+def test_each_scene_or_sequence_is_made_once_and_once_more_where_a_process_begins_in_its_midst(sequences: int) -> None:
+    count, scenes = 5 * WorkerLimits().tasks_per_process, 7 if sequences else 60
+    assert cost(count, scenes, sequences).work_s(2) == (60 + 4) * 0.5 + 1000
+    assert cost(count, scenes, sequences).run_s(2) == (5 * 10 + (60 + 4) * 0.5 + 1000) / 2
+    # No more scenes are made than there are pairs.
+    assert cost(62, scenes, sequences).run_s(20) == (20 * 10 + 62 * 0.5 + 1000) / 20
     assert cost(24, 1, sequences=1).work_s(1) == 0.5 + 1000
 
 

@@ -112,7 +112,8 @@ def emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any
     in_sun &= ~scene.ray_test(surface.spawn_ray(lights.to_sun), in_sun)
     radiance = lights.sun_lux * surface.bsdf().eval(mi.BSDFContext(), surface, towards, in_sun)
     if lights.parts_emit:
-        emitted = surface.emitter(scene).eval(surface, hit)
+        # `surface.emitter` also gives the sky, whose registry number in this scene would become part of the kernel.
+        emitted = surface.shape.emitter().eval(surface, hit)
         if shown is not None:
             number: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
             emitted *= dr.gather(mi.Float, shown, number, hit)
