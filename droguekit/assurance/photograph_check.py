@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.importers.coco_boxes import read_boxes
-from datasets_manifest.importers.image_files import IMAGE_SUFFIXES, read_image
+from datasets_manifest.importers.photographs import find_photographs, shown_photograph
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.images import StereoImages
@@ -35,8 +34,6 @@ from nav.detector.detector_registry import network_file
 from nav.detector.onnx_detector import OnnxDetector
 
 _LEAST_SCORE = 0.001
-# Pictures of more bits are shown with the brightest thousandth of them white.
-_WHITE_QUANTILE = 0.999
 
 
 class FoundBox(ResultModel):
@@ -134,38 +131,6 @@ class _Seen:
     size_px: tuple[int, int]
     looks: NDArray[np.float64]
     boxes: tuple[tuple[PixelBox, float], ...]
-
-
-def find_photographs(folder: Path) -> list[Path]:
-    """Image files in a folder and the folders in it, sorted; names that begin with a dot are skipped.
-
-    Raises:
-        ValueError: there is no such folder, or no picture in it.
-    """
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: is no folder of pictures")
-    found = []
-    for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        suffixes = {name: Path(name).suffix.lower() for name in files if not name.startswith(".")}
-        found += [Path(place) / name for name, suffix in suffixes.items() if suffix in IMAGE_SUFFIXES]
-    if not found:
-        raise ValueError(f"{folder}: has no pictures; {', '.join(IMAGE_SUFFIXES)} are read")
-    return sorted(found)
-
-
-def shown_photograph(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) or (H, W) uint8 picture of a file, for screens.
-
-    Raises:
-        ValueError: it cannot be read; names the file.
-    """
-    pixels, _ = read_image(path)
-    if pixels.dtype == np.uint8:
-        return np.asarray(pixels, dtype=np.uint8)
-    white = max(float(np.quantile(pixels, _WHITE_QUANTILE)), 1.0)
-    shown: NDArray[np.uint8] = np.minimum(np.rint(pixels * (255.0 / white)), 255.0).astype(np.uint8)
-    return shown
 
 
 def check_photographs(

@@ -156,6 +156,14 @@ def train(
             help="Initial weights: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training.",
         ),
     ] = None,
+    photographs: Annotated[
+        Path | None,
+        typer.Option(
+            "--photographs",
+            metavar="DIR",
+            help="Pictures of any kind and size without a drogue, in which the network learns to find none.",
+        ),
+    ] = None,
     workers: WorkersOption = None,
 ) -> None:
     """Train a detector on datasets, evaluate it on their test splits, and export it as ONNX.
@@ -176,7 +184,9 @@ def train(
         "device": device,
         "threads": threads,
     }
-    options = TrainingOptions(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
+    options = TrainingOptions(
+        tuple(sources), settings, changes, size, final_size, cache, start_from, photographs, workers
+    )
     result = train_detector(options, out, progress_report())
     for line in training_lines(result):
         typer.echo(line)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from datasets_manifest.atomic import write_text_atomic
-from droguekit.assurance.photograph_check import PhotographCheck, PhotographResult, check_lines, shown_photograph
+from datasets_manifest.importers.photographs import shown_photograph
+from droguekit.assurance.photograph_check import PhotographCheck, PhotographResult, check_lines
 from droguekit.scoring.report.html_page import page_template
 from droguekit.scoring.report.label_drawing import draw_box, jpeg_uri, resized
 

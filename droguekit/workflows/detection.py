@@ -38,6 +38,7 @@ class TrainingOptions:
         size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
         cache: folder for resized images, or None for one in the training's folder.
         start_from: shipped detector or file of initial weights, or None for random ones.
+        photographs: folder of pictures without a drogue to train on beside the sources, or None.
         workers: processes that render; as many as cores and memory allow when None.
     """
 
@@ -48,6 +49,7 @@ class TrainingOptions:
     final_size: str | None
     cache: Path | None
     start_from: str | None
+    photographs: Path | None
     workers: int | None
 
 
@@ -76,6 +78,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         OSError: a file cannot be written.
         KeyboardInterrupt: the user asked to stop, and the state is saved.
     """
+    from datasets_manifest.importers.photographs import find_photographs
     from datasets_manifest.recipe.recipe import RecipeSource
     from droguekit.batch.worker_pool import StopRequest
     from nav.training.training_settings import build_settings, parse_size
@@ -100,11 +103,15 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
     check_training(out, settings, start)
+    if options.photographs is not None:
+        find_photographs(options.photographs)
     datasets = [
         _render_source(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
     ]
     with StopRequest(report.say) as stop:
-        return train(datasets, out, settings, report, options.cache, lambda: stop.is_requested, start)
+        return train(
+            datasets, out, settings, report, options.cache, lambda: stop.is_requested, start, options.photographs
+        )
 
 
 def training_lines(result: TrainingResult) -> Iterator[str]:

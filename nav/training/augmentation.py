@@ -5,9 +5,9 @@ of the low corner, width, height, counted from the corner of the image: the whol
 round, so the ellipse in its box is what rotates. Source of the mosaic: Bochkovskiy et al. 2020, arXiv:2004.10934,
 section 3.3; the seed paper trains with it.
 
-Photometric: colour jitter, blur and noise, and shapes painted as occluders and distractors. Images are encoded by the
-sRGB curve whatever the dataset's sensor (`nav.detector.input_image`), and gains multiply encoded values: half the value
-is about a fifth of the light.
+Photometric: colour jitter, blur, noise, sharpening and JPEG, and shapes painted as occluders and distractors. Images
+are encoded by the sRGB curve whatever the dataset's sensor (`nav.detector.input_image`), and gains multiply encoded
+values: half the value is about a fifth of the light.
 """
 
 from __future__ import annotations
@@ -231,6 +231,10 @@ _BLUR_FRACTION, _BLUR_SIGMA_PX = 0.15, (0.4, 1.6)
 _MOTION_FRACTION, _MOTION_PX = 0.08, (3, 9)
 _NOISE_FRACTION, _NOISE_DN = 0.35, (0.5, 6.0)
 _LOW_LIGHT_NOISE_DN = (2.0, 8.0)
+# What pictures from the web and from video went through after the camera.
+_RESAMPLED_FRACTION, _RESAMPLED_SCALE = 0.12, (0.35, 0.8)
+_SHARPENED_FRACTION, _SHARPENED_AMOUNT, _SHARPENED_SIGMA_PX = 0.12, (0.3, 1.5), 1.0
+_COMPRESSED_FRACTION, _JPEG_QUALITY = 0.25, (20, 95)
 
 _OCCLUDED_FRACTION = 0.12  # of the drogues
 _MAX_HIDDEN_FRACTION = 0.45  # of a drogue's ellipse; an occluder that would hide more of any drogue is not painted
@@ -246,7 +250,10 @@ _COLOR_SPREAD = 20
 
 
 def color_jitter(rng: np.random.Generator, image: Image) -> Image:
-    """Randomly change tone, colour, sharpness and noise, as other light and cameras do. (H, W, 3) -> (H, W, 3)."""
+    """Randomly change tone, colour, sharpness, noise and coding, as other light and cameras do.
+
+    (H, W, 3) -> (H, W, 3).
+    """
     is_dark = rng.random() < _LOW_LIGHT_FRACTION
     image = cv2.LUT(_mix_colors(rng, image), _tone_curves(rng))
     if is_dark:
@@ -257,6 +264,24 @@ def color_jitter(rng: np.random.Generator, image: Image) -> Image:
         image = _motion_blur(rng, image)
     if is_dark or rng.random() < _NOISE_FRACTION:
         image = _add_noise(rng, image, _log_uniform(rng, _LOW_LIGHT_NOISE_DN if is_dark else _NOISE_DN).item())
+    return _processed(rng, image)
+
+
+def _processed(rng: np.random.Generator, image: Image) -> Image:
+    """Resample, sharpen and compress some images."""
+    if rng.random() < _RESAMPLED_FRACTION:
+        scale, size = rng.uniform(*_RESAMPLED_SCALE), image.shape[1::-1]
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    if rng.random() < _SHARPENED_FRACTION:
+        amount = rng.uniform(*_SHARPENED_AMOUNT)
+        blurred = cv2.GaussianBlur(image, (0, 0), _SHARPENED_SIGMA_PX)
+        image = np.asarray(cv2.addWeighted(image, 1 + amount, blurred, -amount, 0), dtype=np.uint8)
+    if rng.random() < _COMPRESSED_FRACTION:
+        quality = int(rng.integers(_JPEG_QUALITY[0], _JPEG_QUALITY[1] + 1))
+        # OpenCV takes blue for the first channel, and codes blue more coarsely than red.
+        _, coded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+        image = np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
     return image
 
 

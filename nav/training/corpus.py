@@ -30,6 +30,7 @@ from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.augmentation import Boxes, Image
+from nav.training.photographs import Photographs, read_photographs
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text
@@ -39,6 +40,7 @@ EyeIndex = int
 _VERSION = 2  # incremented with every change of a cache's contents
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
 _LOCK_POLL_S = 0.2
+_PHOTOGRAPHS = "photographs"
 
 
 class CachedPair(FrozenModel):
@@ -238,7 +240,7 @@ def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: Si
 
 @dataclass(frozen=True)
 class DatasetStamp:
-    """Name and hashes that identify a dataset."""
+    """Name and hashes that identify a dataset; one of photographs has no manifest, and an empty hash of it."""
 
     name: str
     dataset_sha256: str
@@ -247,14 +249,15 @@ class DatasetStamp:
 
 @dataclass(frozen=True, eq=False)
 class Corpus:
-    """The pairs of all datasets, in one sequence.
+    """The pairs of all datasets, in one sequence, and behind them photographs without a drogue.
 
     Attributes:
-        datasets: in the order given.
+        datasets: in the order given, and the photographs.
         size_px: (height, width) of the images.
         caches: one for each dataset.
         places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
         fault: damaged pairs, which are left out, as one line; None for nothing.
+        without_drogue: photographs to train on beside the pairs, the same for both eyes, or None.
     """
 
     datasets: tuple[DatasetStamp, ...]
@@ -262,6 +265,13 @@ class Corpus:
     caches: tuple[ImageCache, ...]
     places: NDArray[np.int64]
     fault: str | None = None
+    without_drogue: Photographs | None = None
+
+    @property
+    def photographs(self) -> NDArray[np.int64]:
+        """(n,) indices of the photographs, as if they were pairs."""
+        count = 0 if self.without_drogue is None else len(self.without_drogue.images)
+        return np.arange(len(self.places), len(self.places) + count)
 
     def split(self, name: SplitName) -> NDArray[np.int64]:
         """(n,) indices of the pairs of a split."""
@@ -275,12 +285,17 @@ class Corpus:
 
     def image(self, pair: int, eye: EyeIndex) -> Image:
         """(H, W, 3) image of one eye, read-only."""
+        if self.without_drogue is not None and pair >= len(self.places):
+            photograph: Image = self.without_drogue.images[pair - len(self.places)]
+            return photograph
         dataset, index = self.places[pair]
         image: Image = self.caches[dataset].images[index, eye]
         return image
 
     def boxes(self, pair: int, eye: EyeIndex) -> Boxes:
         """(n, 4) boxes of one eye: that of the sought drogue if it is seen, then those of drogues beside it."""
+        if pair >= len(self.places):
+            return np.zeros((0, 4))
         entry = self.entry(pair)
         found = [*([] if entry.boxes[eye] is None else [entry.boxes[eye]]), *entry.others[eye]]
         return np.array(found, dtype=np.float64).reshape(-1, 4)
@@ -293,6 +308,7 @@ def open_corpus(
     threads: int,
     observer: TrainingObserver,
     should_stop: Callable[[], bool] = lambda: False,
+    photographs: Path | None = None,
 ) -> Corpus:
     """Open the datasets of a training, and check everything in them that could stop it later.
 
@@ -303,14 +319,16 @@ def open_corpus(
         threads: number of decoding threads.
         observer: is informed of the progress.
         should_stop: called after every pair.
+        photographs: folder of pictures without a drogue, or None.
 
     Raises:
         ValueError: no datasets, one twice, one without a whole pair, no drogue, images of different sizes, or
-            no split to train on; the message names the path.
+            no split to train on, or a photograph that cannot be read; the message names the path.
         OSError: the cache cannot be written.
         KeyboardInterrupt: `should_stop` returned true.
     """
     datasets = _open_datasets(paths)
+    without = None if photographs is None else read_photographs(photographs, size_px)
     caches: list[ImageCache] = []
     fault: str | None = None
     for dataset in datasets:
@@ -328,8 +346,10 @@ def open_corpus(
         DatasetStamp(dataset.manifest.name, dataset.manifest.dataset_sha256, dataset.manifest.manifest_sha256)
         for dataset in datasets
     )
+    if without is not None:
+        stamps += (DatasetStamp(_PHOTOGRAPHS, without.sha256, ""),)
     places = [(number, index) for number, cache_ in enumerate(caches) for index in range(len(cache_.pairs))]
-    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault)
+    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault, without)
     if not any(len(corpus.boxes(pair, eye)) for pair in corpus.split("train") for eye in (0, 1)):
         raise ValueError(f"{paths[0]}: shows no drogue in any image of the split train; there is nothing to learn from")
     return corpus

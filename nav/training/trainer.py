@@ -1,7 +1,8 @@
 """The training loop: batches of augmented images, optimizer steps, validation after each epoch, checkpoints.
 
 A batch is a function of the settings, the corpus and its number. An epoch shows every training image once, in an order
-of its own. A mosaic shows one such image beside three that are drawn at random.
+of its own. A mosaic shows one such image beside three that are drawn at random. Where there are photographs without a
+drogue, they take the places of some of the three, and of some images alone.
 """
 
 from __future__ import annotations
@@ -105,12 +106,27 @@ class BatchMaker:
         # The first of the four may be in any corner.
         samples = [samples[tile] for tile in rng.permutation(len(samples))]
         members = [self._members(int(sample)) for sample in samples]
+        if len(self._corpus.photographs):
+            members = self._with_photographs(rng, members, samples.index(first))
         size = settings.size_at(step)
         views = self._sample_views(rng, members, size, is_mosaic)
         for eye_number, of_eye in enumerate(zip(*members, strict=True)):
             # Both eyes have the same views, but each has its own light, noise, occluders and distractors.
             light = sample_generator(settings.seed, epoch, position, f"light {eye_number}")
             yield self._paint(light, list(of_eye), views, size)
+
+    def _with_photographs(
+        self, rng: np.random.Generator, members: list[list[tuple[int, EyeIndex]]], kept: int
+    ) -> list[list[tuple[int, EyeIndex]]]:
+        """The same with some images replaced by photographs, but not that of place `kept` in a mosaic."""
+        replaced = rng.random(len(members)) < self._settings.photograph_fraction
+        chosen = self._corpus.photographs[rng.integers(len(self._corpus.photographs), size=len(members))]
+        if len(members) > 1:
+            replaced[kept] = False
+        return [
+            [(int(photograph), eye) for _, eye in own] if is_replaced else own
+            for own, is_replaced, photograph in zip(members, replaced, chosen, strict=True)
+        ]
 
     def _members(self, sample: int) -> list[tuple[int, EyeIndex]]:
         """Pair and eye of each image of a sample."""

@@ -79,6 +79,7 @@ def train(
     cache: Path | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     start: StartingWeights | None = None,
+    photographs: Path | None = None,
 ) -> TrainingResult:
     """Train, evaluate on the split `test` and export; a training that was interrupted in this folder is resumed.
 
@@ -90,10 +91,11 @@ def train(
         cache: folder of the image caches; `out / "cache"` by default.
         should_stop: called after every step.
         start: weights to start from instead of random ones.
+        photographs: folder of pictures without a drogue to train on beside the datasets, or None.
 
     Raises:
-        ValueError: a dataset that cannot be used, a device that is not available, weights of another network, a folder
-            of another training, or one that another run uses; the message names the path.
+        ValueError: a dataset or photograph that cannot be used, a device that is not available, weights of another
+            network, a folder of another training, or one that another run uses; the message names the path.
         OSError: a file cannot be written.
         KeyboardInterrupt: `should_stop` returned true; the state is saved, and the same call resumes the training.
     """
@@ -104,7 +106,7 @@ def train(
     with _locked(out), limit_threads(settings.threads):
         remove_partial_files(out)
         size, threads = settings.largest_size_px, settings.loader_threads
-        corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
+        corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop, photographs)
         state = new_state(starting_network(settings, start), settings, compute)
         is_resumed = restore_state(out, state, settings, corpus.datasets)
         if start is not None and start.need_batch_statistics and not is_resumed:
@@ -157,10 +159,12 @@ def _recalibrate_start(
 def _summary(corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice, state: TrainingState) -> str:
     pairs = {split: len(corpus.split(split)) for split in ("train", "val", "test")}
     weights = sum(each.numel() for each in state.network.parameters())
+    photographs = len(corpus.photographs)
+    beside = f", {photographs} cut-outs of photographs" if photographs else ""
     done = f", resumed after {state.step * settings.batch_images:,}" if state.step else ""
     return (
         f"{settings.variant}, {settings.attention}, {settings.fusion}: {weights / 1e6:.2f} million weights; "
-        f"{pairs['train']} pairs to train on, {pairs['val']} to validate, {pairs['test']} to test; "
+        f"{pairs['train']} pairs to train on{beside}, {pairs['val']} to validate, {pairs['test']} to test; "
         f"{settings.image_passes:,} images{done}; {compute.device.type}, {'bf16' if compute.bf16 else 'float32'}"
     )
 
@@ -197,7 +201,7 @@ def _evaluate_and_export(
         score_threshold=threshold,
         large_from_px=settings.large_from_px,
         licence=settings.licence,
-        manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.datasets) == 1 else "",
+        manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.caches) == 1 else "",
         network=network.config.to_dict(),
         training=table,
     )

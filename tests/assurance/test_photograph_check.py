@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from datasets_manifest.importers.photographs import find_photographs
 from datasets_manifest.storage.reader import Dataset
-from droguekit.assurance.photograph_check import PhotographCheck, check_lines, check_photographs, find_photographs
+from droguekit.assurance.photograph_check import PhotographCheck, check_lines, check_photographs
 from droguekit.assurance.picture_looks import LOOKS, KnownLooks, measure_looks
 from droguekit.batch.progress import progress_report
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
