@@ -323,8 +323,8 @@ class MappedEnvironmentRadiance(EnvironmentRadiance):
         return self._coarse.radiance(level.reshape(1, -1, 3)).reshape(level.shape)
 
 
-# A recipe visits its scenes in turn; each takes half a megabyte.
-@lru_cache(maxsize=128)
+# The frames of a scene are made in a row.
+@lru_cache(maxsize=16)
 def _of_scene(key: str, folder: Path | None) -> EnvironmentRadiance:
     environment = Environment.model_validate_json(key)
     if environment.map is None:

@@ -25,6 +25,7 @@ from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, 
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
 from droguekit.batch.resume import check_frames, finish_frames, open_dataset
+from droguekit.batch.task_queue import TaskQueue
 from droguekit.batch.worker_pool import (
     MAX_ATTEMPTS,
     StopRequest,
@@ -108,8 +109,7 @@ def make_frames(
 
     Args:
         task: makes a frame.
-        todo: indices of the frames, each once. Worker processes take them by `unit_of_frame`, a Dask scheduler in
-            this order.
+        todo: indices of the frames, each once; those of a unit (`unit_of_frame`) are made in a row.
         options: who makes them.
         report: is told of the progress.
         events: gets every attempt.
@@ -183,13 +183,14 @@ def _attempts(
     task: FrameTask, todo: Sequence[int], options: ExecutionOptions, stop: StopRequest
 ) -> Generator[TaskAttempt[FrameReport], None, None]:
     timeout_s = frame_timeout_s(task.recipe) if options.timeout_s is None else options.timeout_s
+    unit_of = partial(unit_of_frame, task.recipe)
     if options.scheduler is not None:
-        return run_on_cluster(task, todo, options.scheduler, timeout_s, stop)
+        return run_on_cluster(task, TaskQueue(todo, unit_of).in_rows(), options.scheduler, timeout_s, stop)
     workers = min(options.worker_count(), len(todo))
     share_gib = available_memory_gib() / max(workers, 1)
     is_cold = not has_compiled(task.recipe.render.engine, options.device)
     limits = WorkerLimits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib), is_first_alone=is_cold)
-    return run_tasks(task, todo, workers, limits, stop, task.pack, partial(unit_of_frame, task.recipe))
+    return run_tasks(task, todo, workers, limits, stop, task.pack, unit_of)
 
 
 def unit_of_frame(recipe: Recipe, frame_index: int) -> int:

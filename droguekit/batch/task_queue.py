@@ -35,6 +35,10 @@ class TaskQueue:
         self._waiting.clear()
         self._count = 0
 
+    def in_rows(self) -> list[int]:
+        """All waiting tasks, group by group."""
+        return [index for tasks in self._waiting.values() for index in tasks]
+
     def take(self, before: int | None, held: Collection[int] = ()) -> tuple[int, int]:
         """Take a task for a process.
 

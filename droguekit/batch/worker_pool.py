@@ -24,7 +24,7 @@ from types import FrameType
 from typing import Any, Generic, Self, TypeVar, cast
 
 from datasets_manifest.atomic import remove_scratch_folders
-from droguekit.batch.execution import resident_gib
+from droguekit.batch.execution import GIB_PER_WORKER, resident_gib, return_free_memory
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.numerical_threads import one_thread_in_new_processes
 
@@ -234,6 +234,8 @@ def _serve(
                 value = then(index, value)
         except Exception as raised:
             value, error = None, _picklable(raised)
+        if resident_gib() > GIB_PER_WORKER:
+            return_free_memory()
         connection.send((value, error, resident_gib()))
 
 

@@ -20,6 +20,10 @@ def test_a_process_ends_its_group_before_it_begins_another_and_leaves_those_of_o
     assert queue.take(1, {2}) == (4, 1)
 
 
+def test_rows_are_groups_in_the_order_of_their_first_tasks() -> None:
+    assert TaskQueue([5, 0, 4, 3, 2, 1], lambda index: index % 3).in_rows() == [5, 2, 0, 3, 4, 1]
+
+
 def test_where_all_groups_are_held_the_one_with_the_most_tasks_is_shared() -> None:
     queue = TaskQueue([0, 1, 10, 11, 12], lambda index: index // 10)
     assert queue.take(None, {0, 1}) == (10, 1)
