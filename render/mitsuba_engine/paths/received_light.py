@@ -112,6 +112,21 @@ def sky_received(rays: FrameRays, points: MattPoints, first: Any, active: Any) -
     return _sky_along(rays, _towards(points, first), points.known, active)
 
 
+def sky_seen_and_hidden(rays: FrameRays, points: MattPoints, first: Any) -> tuple[Any, Any]:
+    """Radiance of the sky along one path from each point, where it is seen and where something hides it. [cd/m2]
+
+    Args:
+        rays, points, first: as for `sky_received`.
+
+    Returns:
+        By the points, 0 where it is hidden; 0 where it is seen.
+    """
+    ray = _towards(points, first)
+    hit = rays.scene.ray_test(ray, mi.Bool(True))
+    sky = unknown_sky(rays.scene, ray, mi.Bool(True), mi.Bool(False), mi.Float(0.0))
+    return dr.select(hit, 0.0, sky), dr.select(hit, sky, 0.0)
+
+
 def _sky_along(rays: FrameRays, ray: Any, known: Any, active: Any) -> Any:
     return unknown_sky(rays.scene, ray, active, rays.scene.ray_test(ray, active), known)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from drogue_models.parts import Part
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.paths.rays import FrameRays, means_by_pixel, rows_of, stratified_over_image
-from render.mitsuba_engine.paths.received_light import matt_points, sky_received
+from render.mitsuba_engine.paths.received_light import matt_points, sky_received, sky_seen_and_hidden
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct, trace_residual
 from render.mitsuba_engine.scene import by_shape
 from render.mitsuba_engine.trace_request import DROGUE_PARTS
@@ -39,6 +40,8 @@ _SAME_PLANE_PER_REACH = 0.25
 # cos^16: half the weight at 17 degrees.
 _NORMAL_POWER = 4
 _LEAST_REFLECTANCE = 1e-4
+# Whether more light comes from the sky or is hidden changes over tens of pixels, and samples of one place cannot tell.
+_AROUND_STEPS = 5
 # Weight of neighbours on other surfaces: their light is the best estimate where no other is near.
 _WEIGHT_ROUND_CORNERS = 1e-4
 # A ray whose nearest centres weigh less than this sees a surface that no centre does.
@@ -94,13 +97,16 @@ class SurfaceLight:
         self._part_of_row = np.array(dr.gather(mi.UInt32, self._part, shape))
         self._points = matt_points(surface, dr.gather(mi.Float, rays.lights.open_to_sky, shape))
         dr.eval(self._points)
-        known = np.array(self._points.known)
+        self._known = known = np.array(self._points.known)
         self.beside: NDArray[np.bool_] = (DROGUE_PARTS[self._part_of_row] == 0) & (known > 0)
         length = _foreshortening(surface)
         dr.eval(length)
         self._pixel_length = jit_array(mi.Float, np.where(self.beside, np.array(length), np.float32(1.0)))
         self._normal, self._point = _rows(normal, known), _rows(surface.p, np.array(surface.t))
         self._mean = self._error = self._point
+        open_sky = self._points.known * rays.lights.sky.towards(normal)
+        dr.eval(open_sky)
+        self._open_sky = rows_of(open_sky)
 
     def _surface(self, pixel: Any) -> Any:
         ray = self._rays.through(pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
@@ -161,16 +167,41 @@ class SurfaceLight:
         return means_by_pixel([*(rest / dr.maximum(reflectance, _LEAST_REFLECTANCE))], count)
 
     def _sky_means(self, row: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-        """(P, 3) means over paths that end at the next surface. [cd/m2]"""
-        found = [np.zeros((0, 3), dtype=np.float32)]
+        """(P, 3) means over paths that end at the next surface. [cd/m2]
+
+        The sky that is hidden is subtracted from that of an open place, or the sky that is seen is taken, whichever
+        varies less around: inside an engine's intake the glow of a low sun would leave blotches where it is hidden.
+        """
+        found = [np.zeros((0, 8), dtype=np.float32)]
         lattice = [place // self._step_px for place in np.divmod(self.pixel, self._rays.width_px)]
         for chunk in self._rays.launch_chunks(row, count):
             if len(chunk):
                 first = stratified_over_image(self._rays, (lattice[0][chunk], lattice[1][chunk]), count)
                 of_lane = dr.arange(mi.UInt32, len(chunk) * count) // dr.opaque(mi.UInt32, count)
                 points = self._points.at(dr.gather(mi.UInt32, jit_array(mi.UInt32, chunk), of_lane))
-                found.append(means_by_pixel([*sky_received(self._rays, points, first, mi.Bool(True))], count))
-        return np.concatenate(found)
+                seen, hidden = sky_seen_and_hidden(self._rays, points, first)
+                channels = [*seen, *hidden, dr.square(dr.sum(seen)), dr.square(dr.sum(hidden))]
+                found.append(means_by_pixel(channels, count))
+        means = np.concatenate(found)
+        seen, hidden = means[:, :3], means[:, 3:6]
+        varies = [
+            self._around(row, np.maximum(squares - light.sum(axis=1) ** 2, 0.0))
+            for light, squares in ((seen, means[:, 6]), (hidden, means[:, 7]))
+        ]
+        share = varies[0] / np.maximum(varies[0] + varies[1], np.float32(1e-30))
+        share = (self._known[row] * np.where(varies[1] > 0, share, np.float32(1.0)))[:, None]
+        mean: NDArray[np.float32] = (1 - share) * (seen - self._open_sky[row]) - share * hidden
+        return mean
+
+    def _around(self, row: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(P,) means of the values of these rows over the centres around each."""
+        cell = self._cell_of(self.pixel[row])
+        grids = np.zeros((2, self._cells), dtype=np.float32)
+        grids[0, cell], grids[1, cell] = values, 1.0
+        kernel = (_AROUND_STEPS, _AROUND_STEPS)
+        sums, counts = (cv2.boxFilter(grid.reshape(-1, self._columns), -1, kernel).reshape(-1)[cell] for grid in grids)
+        mean: NDArray[np.float32] = sums / counts
+        return mean
 
     def smooth(self, mask: NDArray[np.bool_], most_px: float) -> None:
         """Replace the light of some pixels by weighted means over their neighbours.
