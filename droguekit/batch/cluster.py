@@ -21,7 +21,8 @@ from datasets_manifest.storage.manifest import cpu_features, software_versions
 from datasets_manifest.storage.storage import absolute, open_storage
 from droguekit.batch.execution import resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
-from droguekit.batch.worker_pool import MAX_ATTEMPTS, StopRequest, TaskAttempt, run_in_own_process
+from droguekit.batch.stop_request import StopRequest
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, run_in_own_process
 from render.device import Device
 from render.engine import load_engine
 

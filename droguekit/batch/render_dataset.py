@@ -25,10 +25,10 @@ from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, 
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
 from droguekit.batch.resume import check_frames, finish_frames, open_dataset
+from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.batch.worker_pool import (
     MAX_ATTEMPTS,
-    StopRequest,
     TaskAttempt,
     WorkerDiedError,
     WorkerLimits,

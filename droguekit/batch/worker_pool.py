@@ -1,7 +1,4 @@
-"""Run many tasks in worker processes, so that a crash costs one attempt of one task and the others continue.
-
-The first Ctrl-C finishes running tasks, the second stops at once.
-"""
+"""Run many tasks in worker processes, so that a crash costs one attempt of one task and the others continue."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ import multiprocessing
 import os
 import pickle
 import signal
-import threading
 import time
 import traceback
 from collections import Counter
@@ -20,69 +16,13 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
-from types import FrameType
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from datasets_manifest.atomic import remove_scratch_folders
 from droguekit.batch.execution import GIB_PER_WORKER, resident_gib, return_free_memory
+from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.numerical_threads import one_thread_in_new_processes
-
-# A cluster asks a job to end with SIGTERM.
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-class StopRequest:
-    """While entered, the first Ctrl-C or SIGTERM is a request, and the second raises `KeyboardInterrupt`.
-
-    It can be waited for like a connection: it becomes readable when the request comes.
-
-    Attributes:
-        is_requested: whether the first signal has come.
-        say: prints a line for the user.
-        wake: called then, in the signal handler, for code that does not wait for the descriptor.
-    """
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        """Take the function that prints a line for the user."""
-        self.is_requested = False
-        self.wake: Callable[[], object] | None = None
-        self.say = say
-        self._before: dict[signal.Signals, Any] = {}
-        self._reader = self._writer = -1
-
-    def __enter__(self) -> Self:
-        """Install the signal handlers; outside the main thread, where Python allows none, nothing changes."""
-        self._reader, self._writer = os.pipe()
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._hear) for number in _SIGNALS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Restore the signal handlers."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        os.close(self._reader)
-        os.close(self._writer)
-
-    def fileno(self) -> int:
-        """The descriptor that becomes readable."""
-        return self._reader
-
-    def acknowledge(self, in_hand: int) -> None:
-        """Tell the user what happens next."""
-        self.say(
-            f"stopping after the running frames ({in_hand}); press Ctrl-C again to stop at once and lose only those"
-        )
-
-    def _hear(self, number: int, frame: FrameType | None) -> None:
-        if self.is_requested:
-            raise KeyboardInterrupt
-        self.is_requested = True
-        os.write(self._writer, b"!")
-        if self.wake is not None:
-            self.wake()
-
 
 READY, UNTIMED = "ready", "untimed"
 _CONTEXT = multiprocessing.get_context("spawn")

@@ -80,7 +80,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     """
     from datasets_manifest.importers.photographs import find_photographs
     from datasets_manifest.recipe.recipe import RecipeSource
-    from droguekit.batch.worker_pool import StopRequest
+    from droguekit.batch.stop_request import StopRequest
     from nav.training.training_settings import build_settings, parse_size
 
     changes = {name: value for name, value in options.changes.items() if value is not None}

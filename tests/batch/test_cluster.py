@@ -22,7 +22,7 @@ from droguekit.batch.cluster import ClusterTask, WorkerBuild, current_build
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.batch.worker_pool import StopRequest
+from droguekit.batch.stop_request import StopRequest
 from droguekit.cli.main import WRONG_INPUT, run
 from render.engine import EngineUnavailableError
 from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, file_hashes, render_recipe
