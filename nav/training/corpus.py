@@ -30,7 +30,7 @@ from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.augmentation import Boxes, Image
-from nav.training.photographs import Photographs, read_photographs
+from nav.training.negative_photographs import Photographs, read_photographs
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text

@@ -13,7 +13,7 @@ import pytest
 from droguekit.batch.progress import PlainProgress
 from nav.training.augmentation import ImageView
 from nav.training.corpus import Corpus, open_corpus
-from nav.training.photographs import Photographs, read_photographs
+from nav.training.negative_photographs import Photographs, read_photographs
 from nav.training.trainer import BatchMaker
 from nav.training.training_settings import build_settings
 
