@@ -172,7 +172,9 @@ class SurfaceLight:
         The sky that is hidden is subtracted from that of an open place, or the sky that is seen is taken, whichever
         varies less around: inside an engine's intake the glow of a low sun would leave blotches where it is hidden.
         """
-        found = [np.zeros((0, 8), dtype=np.float32)]
+        if not len(row):
+            return np.zeros((0, 3), dtype=np.float32)
+        found = []
         lattice = [place // self._step_px for place in np.divmod(self.pixel, self._rays.width_px)]
         for chunk in self._rays.launch_chunks(row, count):
             if len(chunk):
@@ -188,7 +190,8 @@ class SurfaceLight:
             self._around(row, np.maximum(squares - light.sum(axis=1) ** 2, 0.0))
             for light, squares in ((seen, means[:, 6]), (hidden, means[:, 7]))
         ]
-        share = varies[0] / np.maximum(varies[0] + varies[1], np.float32(1e-30))
+        # Running sums leave a rounding error, of either sign, where nothing varies.
+        share = np.clip(varies[0] / np.maximum(varies[0] + varies[1], np.float32(1e-30)), 0.0, 1.0)
         share = (self._known[row] * np.where(varies[1] > 0, share, np.float32(1.0)))[:, None]
         mean: NDArray[np.float32] = (1 - share) * (seen - self._open_sky[row]) - share * hidden
         return mean
