@@ -1,4 +1,4 @@
-"""`python -m studies.detector_comparison`: compares our detectors with YOLOv8 on the same corpus.
+"""`python -m studies.detector_comparison`: compares our detectors with those of ultralytics on the same corpus.
 
 Trains, exports, times and scores the detectors; a stage whose output file exists is skipped.
 """
@@ -36,7 +36,8 @@ from studies.detector_comparison.options import (
     input_size_px,
     print_status,
 )
-from studies.detector_comparison.yolov8 import (
+from studies.detector_comparison.ultralytics_peers import (
+    PEERS,
     YoloDetector,
     check_corpus,
     export_corpus,
@@ -47,7 +48,6 @@ from studies.detector_comparison.yolov8 import (
     yolo_python,
 )
 
-PEERS = ("yolov8s", "yolov8n")
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
 _FREE_TO_CHANGE = ("ours", "peers", "threads", "rounds", "device", "environment")
@@ -216,7 +216,7 @@ def _peer_network(options: ComparisonOptions, out: Path, name: str, say: Say) ->
 
 
 def _peer_training(options: ComparisonOptions, out: Path, name: str, folder: Path, say: Say) -> dict[str, Any]:
-    """The task by which `yolo_script` trains a peer, with the corpus exported for it."""
+    """The task by which `ultralytics_script` trains a peer, with the corpus exported for it."""
     data = export_corpus(options.corpus, out / "pictures", options.size_px).resolve()
     length = training_length(options.image_passes, training_image_count(options.corpus))
     passes = f"{length.epochs} epochs, {length.image_passes} image passes"
@@ -314,10 +314,11 @@ def main(
         ),
     ] = None,
     peer: Annotated[
-        list[Literal["yolov8s", "yolov8n"]] | None, typer.Option("--peer", help="Repeatable; both by default.")
+        list[Literal["yolov8s", "yolov8n", "yolo11n", "yolo12n", "yolo26n"]] | None,
+        typer.Option("--peer", help="Repeatable; all by default."),
     ] = None,
 ) -> None:
-    """Train YOLOv8s and YOLOv8n from scratch, time them in turns with our detectors, and score all by our benchmark.
+    """Train networks of ultralytics from scratch, time all detectors in turns, and score them by our benchmark.
 
     With 0 image passes nothing is trained or scored: only parameters, operations and times are measured.
     """

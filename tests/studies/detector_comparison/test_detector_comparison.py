@@ -42,7 +42,7 @@ from studies.detector_comparison.ablation import (
     settings_text,
 )
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.yolov8 import (
+from studies.detector_comparison.ultralytics_peers import (
     check_corpus,
     export_corpus,
     run_script,
@@ -80,6 +80,7 @@ def order(corpus: Path, folder: Path, **changes: object) -> ComparisonOptions:
         "device": "cpu",
         "seed": 0,
         "environment": folder / "environment",
+        "peers": ("yolov8s", "yolov8n"),
     }
     return ComparisonOptions(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -184,7 +185,7 @@ def test_an_error_of_ultralytics_names_the_log_and_its_last_line(tmp_path: Path)
 
 def test_the_script_needs_nothing_of_ours() -> None:
     # In isolated mode with another folder as home, as in the peers' environment.
-    script = Path(run_script.__code__.co_filename).with_name("yolo_script.py")
+    script = Path(run_script.__code__.co_filename).with_name("ultralytics_script.py")
     ended = subprocess.run([sys.executable, "-I", str(script)], input="{}", capture_output=True, text=True, check=False)
     assert "No module named 'ultralytics'" in ended.stderr
 

@@ -16,7 +16,7 @@ from geometry.stereo import Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.onnx_cost import network_cost
 from studies.detector_comparison.latency import _latency, measure_latency
-from studies.detector_comparison.yolov8 import YoloDetector, decode_rows
+from studies.detector_comparison.ultralytics_peers import YoloDetector, decode_corners, decode_rows
 from tests.support.detector_networks import write_rows_network
 
 
@@ -33,6 +33,19 @@ def test_rows_become_corners_best_first_without_doubles() -> None:
     np.testing.assert_allclose(boxes, [[34, 32, 36, 36], [190, 80, 20, 40]])
     # Single precision of the network's numbers.
     np.testing.assert_allclose(scores, [0.9, 0.7], rtol=1e-6)
+
+
+def test_corners_of_networks_without_suppression_become_boxes(tmp_path: Path) -> None:
+    # Low and high corner, score, class; both boxes stay, though they overlap.
+    rows = np.array([[10, 20, 30, 60, 0.6, 0], [10, 20, 30, 62, 0.9, 0], [1, 2, 3, 4, 0.1, 0]], np.float32)
+    boxes, scores = decode_corners(rows, 0.25)
+    np.testing.assert_allclose(boxes, [[10, 20, 20, 42], [10, 20, 20, 40]])
+    np.testing.assert_allclose(scores, [0.9, 0.6], rtol=1e-6)
+    # The same through a file: of 128 x 96 px that fit into 64 x 64 from row 8 on.
+    detector = YoloDetector(write_rows_network(tmp_path / "corners.onnx", np.stack([rows, 0 * rows])), 1)
+    found = detector.candidates(images(), 0.25)
+    assert found["right"] == () and len(found["left"]) == 2
+    np.testing.assert_allclose(found["left"][0].box_xywh_px, [19.5, 23.5, 40, 84], atol=1e-4)
 
 
 def test_nothing_found_is_no_box() -> None:

@@ -1,4 +1,4 @@
-"""YOLOv8: its own virtual environment, its training on our corpus, and its exported network as a detector.
+"""Networks of ultralytics: their own virtual environment, training on our corpus, and use as detectors.
 
 The environment is separate so that nothing of ours depends on ultralytics. The exported images are those that our own
 networks see, with the drogue as the only class. The network runs like ours: same input image, same runtime, both eyes
@@ -32,7 +32,7 @@ from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import Letterbox, input_image, network_input
 
 # torch as in our own environment. ultralytics is installed without its dependencies: opencv-python would need the
-# libraries of a display, and torchvision need not even load, see `yolo_script`.
+# libraries of a display, and torchvision need not even load, see `ultralytics_script`.
 _TORCH = ("torch==2.13.0", "numpy>=1.26,<2", "onnx>=1.17")
 _LIGHT = (
     *(
@@ -53,7 +53,9 @@ _WITHOUT_DEPENDENCIES = (
 )
 _DONE = ".detector-peers"
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
-_SCRIPT = Path(__file__).with_name("yolo_script.py")
+PEERS = ("yolov8s", "yolov8n", "yolo11n", "yolo12n", "yolo26n")
+"""Names of their configurations."""
+_SCRIPT = Path(__file__).with_name("ultralytics_script.py")
 
 
 def yolo_python(folder: Path, say: Callable[[str], None]) -> Path:
@@ -186,7 +188,7 @@ def _row(box_px: PixelBox, placement: Letterbox, size_px: tuple[int, int]) -> st
 
 
 def run_script(python: Path, task: Mapping[str, Any], log: Path, variables: Mapping[str, str]) -> None:
-    """Run a task of `yolo_script` in the peers' environment, with its output in a log.
+    """Run a task of `ultralytics_script` in the peers' environment, with its output in a log.
 
     Raises:
         OSError: it failed; the message has the last line of the output, and names the log.
@@ -242,6 +244,8 @@ def training_length(image_passes: int, images: int) -> TrainingLength:
 _MAX_IOU = 0.7
 _MAX_BOXES = 300
 _DEFAULT_THRESHOLD = 0.25
+# Networks that suppress doubles themselves answer with corners, score and class, the best first.
+_CORNER_COLUMNS = 6
 
 
 def open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
@@ -263,7 +267,7 @@ def open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
 
 
 class YoloDetector:
-    """Runs a YOLOv8 network on both images of a pair in one batch.
+    """Runs a network on both images of a pair in one batch.
 
     Attributes:
         name: how it is called in results.
@@ -296,7 +300,8 @@ class YoloDetector:
         (output,) = self._session.run(None, {self._input_name: network_input(inputs)})
         found: dict[Eye, tuple[Detection, ...]] = {}
         for eye, placement, rows in zip(EYES, placements, output, strict=True):
-            boxes, scores = decode_rows(rows, least_score)
+            decode = decode_corners if rows.shape[1] == _CORNER_COLUMNS else decode_rows
+            boxes, scores = decode(rows, least_score)
             found[eye] = tuple(
                 Detection((x, y, width, height), score)
                 for (x, y, width, height), score in zip(
@@ -326,3 +331,18 @@ def decode_rows(rows: NDArray[np.float32], least_score: float) -> tuple[Array, A
         stay = stay[np.argsort(-scores[stay], kind="stable")][:_MAX_BOXES]
         boxes, scores = boxes[stay], scores[stay]
     return boxes, scores
+
+
+def decode_corners(rows: NDArray[np.float32], least_score: float) -> tuple[Array, Array]:
+    """Decode the boxes and scores of one image of a network that needs no suppression, such as YOLO26.
+
+    Args:
+        rows: (n, 6) low and high corner in coordinates of the input, score, class.
+        least_score: boxes with a lower score are left out.
+
+    Returns:
+        (m, 4) low corner, width, height, and (m,) scores, descending.
+    """
+    kept = rows[rows[:, 4] >= least_score].astype(np.float64)
+    kept = kept[np.argsort(-kept[:, 4], kind="stable")]
+    return np.hstack((kept[:, :2], kept[:, 2:4] - kept[:, :2])), kept[:, 4]

@@ -1,4 +1,6 @@
-"""Trains and exports YOLOv8 in the peers' own environment; run as a file, with its task as JSON on standard input.
+"""Trains and exports networks of ultralytics in an environment of their own.
+
+Run as a file, with its task as JSON on standard input.
 
 Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "side_px", "batch", "threads", "device",
 "seed"}` and `{"do": "export", "weights", "file", "size_px"}`. `weights` may be a configuration: an untrained network.
