@@ -293,8 +293,11 @@ def _log_uniform(rng: np.random.Generator, limits: tuple[float, float], count: i
 def _mix_colors(rng: np.random.Generator, image: Image) -> Image:
     """Change the saturation; some images become grey."""
     saturation = 0.0 if rng.random() < _GREY_FRACTION else rng.uniform(*_SATURATION)
-    if abs(saturation - 1) < 0.1:
-        return image
+    return image if abs(saturation - 1) < 0.1 else saturate(image, saturation)
+
+
+def saturate(image: Image, saturation: float) -> Image:
+    """Move the colours of (H, W, 3) away from grey, or for a saturation below 1 towards it."""
     luminance = np.full((3, 3), (0.2126, 0.7152, 0.0722))  # Rec. 709
     mix = luminance + saturation * (np.eye(3) - luminance)
     return np.asarray(cv2.transform(image, mix), dtype=np.uint8)

@@ -2,7 +2,8 @@
 
 An image cache is a folder that holds one dataset's images at the size of the network's input. It appears whole, by one
 rename, and its name has the dataset's hash and the size. It holds `images.npy`, an array that is mapped into memory,
-and `index.json`. If it is deleted, the next training makes it again.
+`opacities.npy`, of the drogues that can be cut out of them, and `index.json`. If it is deleted, the next training makes
+it again.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.lib import format as npy
@@ -26,10 +28,12 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.records import ViewRecord
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.augmentation import Boxes, Image
+from nav.training.drogue_cutouts import Alpha, Cutout, cut_out
 from nav.training.negative_photographs import Photographs, read_photographs
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
@@ -37,8 +41,8 @@ from nav.training.training_settings import SizePx, size_text
 
 EyeIndex = int
 """0 the left eye, 1 the right."""
-_VERSION = 2  # incremented with every change of a cache's contents
-_IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
+_VERSION = 3  # incremented with every change of a cache's contents
+_IMAGES_FILE, _OPACITIES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "opacities.npy", "index.json", ".lock"
 _LOCK_POLL_S = 0.2
 _PHOTOGRAPHS = "photographs"
 
@@ -52,6 +56,7 @@ class CachedPair(FrozenModel):
         boxes: of the left and the right eye: the visible part of the drogue in the cached image, x, y of the low
             corner, width, height, counted from the image's corner; None where none is visible. [px]
         others: of both eyes, those of the drogues beside it. [px]
+        cutouts: of both eyes, where the drogue can be cut out, or None where it is not wholly seen.
     """
 
     frame_index: int
@@ -61,6 +66,7 @@ class CachedPair(FrozenModel):
         (),
         (),
     )
+    cutouts: tuple[Cutout | None, Cutout | None] = (None, None)
 
 
 class _Index(FrozenModel):
@@ -79,15 +85,18 @@ class ImageCache:
         images: (P, 2, H, W, 3) left and right, gamma-encoded red, green, blue; memory-mapped.
         pairs: the labels of P pairs.
         faults: of the other pairs, which are damaged.
+        opacities: (n,) of all cut-outs, one after the other, row by row, 0 to 255; memory-mapped.
     """
 
     images: NDArray[np.uint8]
     pairs: tuple[CachedPair, ...]
     faults: PairFaults
+    opacities: NDArray[np.uint8]
 
 
 class _ReadPair(NamedTuple):
     images: list[NDArray[np.uint8]]
+    cutouts: list[tuple[Cutout, Alpha] | None]
     entry: CachedPair
 
 
@@ -163,6 +172,7 @@ def _read(cache_folder: Path, dataset: Dataset, size_px: SizePx) -> ImageCache |
     try:
         index = _Index.model_validate_json((cache_folder / _INDEX_FILE).read_bytes())
         images = np.load(cache_folder / _IMAGES_FILE, mmap_mode="r", allow_pickle=False)
+        opacities = np.load(cache_folder / _OPACITIES_FILE, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
     wanted = (_VERSION, dataset.manifest.dataset_sha256, size_px)
@@ -176,7 +186,7 @@ def _read(cache_folder: Path, dataset: Dataset, size_px: SizePx) -> ImageCache |
         if not found:
             return None
         faults.note(frame_index, found[0])
-    return ImageCache(images, index.pairs, faults)
+    return ImageCache(images, index.pairs, faults, opacities)
 
 
 def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance: Callable[[], None]) -> None:
@@ -190,25 +200,22 @@ def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance:
 
     pairs: list[CachedPair] = []
     damaged: list[_DamagedPair] = []
-    with (part / _IMAGES_FILE).open("wb") as stream:
-        _write_header(stream, (len(dataset.frame_indices), 2, *size_px, 3))
+    with _ArrayFile(part / _IMAGES_FILE, (2, *size_px, 3)) as images, _ArrayFile(part / _OPACITIES_FILE, ()) as alphas:
         for pair in prefetch_map(read, dataset.frame_indices, threads, 2 * threads):
             if isinstance(pair, _DamagedPair):
                 damaged.append(pair)
                 advance()
                 continue
-            # Written, not memory-mapped: a full disk raises an error here, but would kill the process there.
-            for image in pair.images:
-                stream.write(np.ascontiguousarray(image).data)
-            pairs.append(pair.entry)
+            images.append(np.stack(pair.images)[None])
+            offsets = [alphas.append(np.zeros(0, np.uint8) if cut is None else cut[1].ravel()) for cut in pair.cutouts]
+            left, right = (
+                None if cut is None else cut[0].model_copy(update={"offset": offset})
+                for cut, offset in zip(pair.cutouts, offsets, strict=True)
+            )
+            pairs.append(pair.entry.model_copy(update={"cutouts": (left, right)}))
             advance()
         if not pairs:
             raise ValueError(damaged[0].fault)
-        # The header has room for any number of pairs, and so its length stays.
-        stream.seek(0)
-        _write_header(stream, (len(pairs), 2, *size_px, 3))
-        stream.flush()
-        os.fsync(stream.fileno())
     index = _Index(
         version=_VERSION,
         dataset_sha256=dataset.manifest.dataset_sha256,
@@ -219,23 +226,53 @@ def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance:
     (part / _INDEX_FILE).write_text(json.dumps(index.model_dump(mode="json")), encoding="utf-8")
 
 
-def _write_header(stream: BinaryIO, shape: tuple[int, ...]) -> None:
-    header: dict[str, Any] = {"descr": "|u1", "fortran_order": False, "shape": shape}
-    npy.write_array_header_2_0(stream, header)  # type: ignore[no-untyped-call]
+class _ArrayFile:
+    """An array in numpy's format that grows along its first axis.
+
+    Written, not memory-mapped: a full disk raises an error here, but would kill the process there.
+    """
+
+    def __init__(self, path: Path, item_shape: tuple[int, ...]) -> None:
+        self._stream, self._item_shape, self._length = path.open("wb"), item_shape, 0
+
+    def __enter__(self) -> Self:
+        self._write_header()
+        return self
+
+    def append(self, items: NDArray[np.uint8]) -> int:
+        """Write items behind the others; the index of the first."""
+        self._stream.write(np.ascontiguousarray(items).data)
+        self._length += len(items)
+        return self._length - len(items)
+
+    def __exit__(self, *_: object) -> None:
+        # The header has room for any length, and so it stays as long as it is.
+        with self._stream:
+            self._stream.seek(0)
+            self._write_header()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+
+    def _write_header(self) -> None:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (self._length, *self._item_shape)}
+        npy.write_array_header_2_0(self._stream, header)  # type: ignore[no-untyped-call]
 
 
 def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: SizePx) -> _ReadPair:
     record, stereo = dataset.record(frame_index), dataset.images(frame_index)
-    images, boxes, others = [], [], []
+    images, cutouts, boxes, others = [], [], [], []
+    input_wh = (size_px[1], size_px[0])
     for eye in EYES:
-        image, placement = input_image(stereo, eye, (size_px[1], size_px[0]))
+        image, placement = input_image(stereo, eye, input_wh)
         images.append(image)
-        box = getattr(record.views, eye).box_visible_xywh_px
+        view: ViewRecord = getattr(record.views, eye)
+        cutouts.append(cut_out(dataset.part_ids(frame_index, eye), view, placement, input_wh))
+        box = view.box_visible_xywh_px
         boxes.append(None if box is None else tuple(placement.to_input(box)[0].tolist()))
-        beside = [other.box_visible_xywh_px for other in getattr(record.views, eye).neighbours]
+        beside = [other.box_visible_xywh_px for other in view.neighbours]
         others.append(tuple(tuple(placement.to_input(box)[0].tolist()) for box in beside if box is not None))
     entry = CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1]), others=(others[0], others[1]))
-    return _ReadPair(images, entry)
+    return _ReadPair(images, cutouts, entry)
 
 
 @dataclass(frozen=True)
@@ -273,6 +310,11 @@ class Corpus:
         count = 0 if self.without_drogue is None else len(self.without_drogue.images)
         return np.arange(len(self.places), len(self.places) + count)
 
+    @cached_property
+    def pairs_to_cut(self) -> NDArray[np.int64]:
+        """(n,) indices of the pairs of the split `train` whose drogue can be cut out of both images."""
+        return np.array([pair for pair in self.split("train") if None not in self.entry(pair).cutouts], dtype=np.int64)
+
     def split(self, name: SplitName) -> NDArray[np.int64]:
         """(n,) indices of the pairs of a split."""
         return np.array([pair for pair in range(len(self.places)) if self.entry(pair).split == name], dtype=np.int64)
@@ -291,6 +333,15 @@ class Corpus:
         dataset, index = self.places[pair]
         image: Image = self.caches[dataset].images[index, eye]
         return image
+
+    def opacity(self, pair: int, eye: EyeIndex) -> tuple[Cutout, Alpha]:
+        """Where the drogue of one eye is cut out, and its (h, w) opacities, 0 to 255; only of `pairs_to_cut`."""
+        dataset, index = self.places[pair]
+        cutout = self.caches[dataset].pairs[index].cutouts[eye]
+        if cutout is None:
+            raise ValueError(f"pair {pair}: its drogue cannot be cut out")
+        end = cutout.offset + cutout.width * cutout.height
+        return cutout, self.caches[dataset].opacities[cutout.offset : end].reshape(cutout.height, cutout.width)
 
     def boxes(self, pair: int, eye: EyeIndex) -> Boxes:
         """(n, 4) boxes of one eye: that of the sought drogue if it is seen, then those of drogues beside it."""

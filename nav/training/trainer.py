@@ -2,7 +2,8 @@
 
 A batch is a function of the settings, the corpus and its number. An epoch shows every training image once, in an order
 of its own. A mosaic shows one such image beside three that are drawn at random. Where there are photographs without a
-drogue, they take the places of some of the three, and of some images alone.
+drogue, they take the places of some of the three, and of some images alone. Into some images a drogue of another one is
+pasted.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from math import cos, pi
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,6 +40,7 @@ from nav.training.augmentation import (
     whole_view,
 )
 from nav.training.corpus import Corpus, EyeIndex
+from nav.training.drogue_cutouts import Paste, is_clear, paste_drogue, pasted_box, sample_paste
 from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurves, TrainingObserver, write_tables
@@ -52,6 +55,20 @@ _AHEAD_BATCHES = 2
 _STEPS_PER_CURVE_POINT = 10
 # Validation every third epoch before the last input size; the best weights are chosen among those at that size.
 _EPOCHS_PER_VALIDATION = 3
+
+
+class Member(NamedTuple):
+    """An image of a sample.
+
+    Attributes:
+        pair: or a photograph's number behind those of the pairs.
+        eye: whose image.
+        paste: of a drogue into it, or None.
+    """
+
+    pair: int
+    eye: EyeIndex
+    paste: Paste | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +125,8 @@ class BatchMaker:
         members = [self._members(int(sample)) for sample in samples]
         if len(self._corpus.photographs):
             members = self._with_photographs(rng, members, samples.index(first))
+        if len(self._corpus.pairs_to_cut):
+            members = [self._with_pastes(rng, own) for own in members]
         size = settings.size_at(step)
         views = self._sample_views(rng, members, size, is_mosaic)
         for eye_number, of_eye in enumerate(zip(*members, strict=True)):
@@ -115,32 +134,57 @@ class BatchMaker:
             light = sample_generator(settings.seed, epoch, position, f"light {eye_number}")
             yield self._paint(light, list(of_eye), views, size)
 
-    def _with_photographs(
-        self, rng: np.random.Generator, members: list[list[tuple[int, EyeIndex]]], kept: int
-    ) -> list[list[tuple[int, EyeIndex]]]:
+    def _with_photographs(self, rng: np.random.Generator, members: list[list[Member]], kept: int) -> list[list[Member]]:
         """The same with some images replaced by photographs, but not that of place `kept` in a mosaic."""
         replaced = rng.random(len(members)) < self._settings.photograph_fraction
         chosen = self._corpus.photographs[rng.integers(len(self._corpus.photographs), size=len(members))]
         if len(members) > 1:
             replaced[kept] = False
         return [
-            [(int(photograph), eye) for _, eye in own] if is_replaced else own
+            [Member(int(photograph), eye) for _, eye, _ in own] if is_replaced else own
             for own, is_replaced, photograph in zip(members, replaced, chosen, strict=True)
         ]
 
-    def _members(self, sample: int) -> list[tuple[int, EyeIndex]]:
+    def _with_pastes(self, rng: np.random.Generator, members: list[Member]) -> list[Member]:
+        """The same image of each eye, some with a drogue of another pair pasted into it, at the same place."""
+        corpus = self._corpus
+        if rng.random() >= self._settings.pasted_fraction:
+            return members
+        pair = int(corpus.pairs_to_cut[rng.integers(len(corpus.pairs_to_cut))])
+        paste = sample_paste(rng, pair, corpus.boxes(pair, 0)[0], corpus.size_px[::-1])
+        pasted = [member._replace(paste=paste) for member in members]
+        boxes = [self._boxes(member) for member in pasted]
+        return pasted if all(is_clear(own[:1], own[1:]) for own in boxes) else members
+
+    def _members(self, sample: int) -> list[Member]:
         """Pair and eye of each image of a sample."""
         if self._eyes == 2:
             pair = int(self._pairs[sample])
-            return [(pair, 0), (pair, 1)]
-        return [(int(self._pairs[sample // 2]), sample % 2)]
+            return [Member(pair, 0), Member(pair, 1)]
+        return [Member(int(self._pairs[sample // 2]), sample % 2)]
+
+    def _boxes(self, member: Member) -> Boxes:
+        """The boxes of an image, that of a pasted drogue first, so that the view is drawn around it."""
+        boxes, paste = self._corpus.boxes(member.pair, member.eye), member.paste
+        if paste is None:
+            return boxes
+        source = self._corpus.boxes(paste.pair, member.eye)[0]
+        return np.vstack([pasted_box(source, paste, self._corpus.size_px[::-1]), boxes])
+
+    def _image(self, member: Member) -> Image:
+        image = self._corpus.image(member.pair, member.eye)
+        if member.paste is None:
+            return image
+        shown = member.paste.pair, member.eye
+        box, cutout = self._corpus.boxes(*shown)[0], self._corpus.opacity(*shown)
+        return paste_drogue(image, self._corpus.image(*shown), box, *cutout, member.paste)
 
     def _sample_views(
-        self, rng: np.random.Generator, members: list[list[tuple[int, EyeIndex]]], size: SizePx, is_mosaic: bool
+        self, rng: np.random.Generator, members: list[list[Member]], size: SizePx, is_mosaic: bool
     ) -> list[ImageView]:
         source_wh, canvas_wh = self._corpus.size_px[::-1], size[::-1]
         # The view is drawn around the drogue also where only one eye sees it.
-        boxes = [np.vstack([self._corpus.boxes(*member) for member in sample]) for sample in members]
+        boxes = [np.vstack([self._boxes(member) for member in sample]) for sample in members]
         if is_mosaic:
             ranges = _MOSAIC_RANGES.on_canvas(source_wh, canvas_wh)
             return sample_mosaic(rng, [source_wh] * len(boxes), boxes, canvas_wh, ranges)
@@ -150,11 +194,11 @@ class BatchMaker:
         return [sample_view(rng, source_wh, boxes[0], CanvasWindow(0, 0, *canvas_wh), ranges)]
 
     def _paint(
-        self, rng: np.random.Generator, members: list[tuple[int, EyeIndex]], views: list[ImageView], size: SizePx
+        self, rng: np.random.Generator, members: list[Member], views: list[ImageView], size: SizePx
     ) -> tuple[Image, Boxes]:
         canvas = np.full((*size, 3), PADDING_DN, dtype=np.uint8)
         shown = [
-            paint_view(canvas, self._corpus.image(*member), self._corpus.boxes(*member), view)
+            paint_view(canvas, self._image(member), self._boxes(member), view)
             for member, view in zip(members, views, strict=True)
         ]
         boxes = np.vstack(shown)

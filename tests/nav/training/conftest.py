@@ -47,4 +47,4 @@ def ellipse_corpus() -> Corpus:
         box = (float(x), float(y), float(width), float(height))
         pairs.append(CachedPair(frame_index=number, split="train", boxes=(box, box)))
     places = np.array([(0, index) for index in range(12)])
-    return Corpus((), (96, 128), (ImageCache(images, tuple(pairs), PairFaults()),), places)
+    return Corpus((), (96, 128), (ImageCache(images, tuple(pairs), PairFaults(), np.zeros(0, np.uint8)),), places)

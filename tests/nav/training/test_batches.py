@@ -5,7 +5,7 @@ import pytest
 
 from datasets_manifest.random_streams import sample_generator
 from nav.training.corpus import Corpus
-from nav.training.trainer import BatchMaker
+from nav.training.trainer import BatchMaker, Member
 from nav.training.training_settings import build_settings
 
 
@@ -47,9 +47,9 @@ def test_an_epoch_shows_every_image_once(ellipse_corpus: Corpus) -> None:
     shown: list[tuple[int, int]] = []
 
     class Watched(BatchMaker):
-        def _members(self, sample: int) -> list[tuple[int, int]]:
+        def _members(self, sample: int) -> list[Member]:
             members = super()._members(sample)
-            shown.extend(members)
+            shown.extend((pair, eye) for pair, eye, _ in members)
             return members
 
     settings = build_settings(

@@ -149,7 +149,10 @@ def test_validation_uses_the_detectors_input() -> None:
     assert place.offset_px == (0, 4)  # a reduction by 1.54, and margins
     pairs = (CachedPair(frame_index=0, split="val", boxes=((31.0, 50.0, 100.0, 81.0), None)),)
     corpus = Corpus(
-        (), (480, 640), (ImageCache(np.stack([picture, picture])[None], pairs, PairFaults()),), np.array([[0, 0]])
+        (),
+        (480, 640),
+        (ImageCache(np.stack([picture, picture])[None], pairs, PairFaults(), np.zeros(0, np.uint8)),),
+        np.array([[0, 0]]),
     )
     image, boxes = whole_image(corpus, 0, 0, (320, 416))
     given = to_tensor(image[None], ComputeDevice(torch.device("cpu"), bf16=False))
