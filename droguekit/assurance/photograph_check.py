@@ -15,7 +15,6 @@ from datasets_manifest.importers.coco_boxes import read_boxes
 from datasets_manifest.importers.photographs import find_photographs, shown_photograph
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
-from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PixelBox
 from droguekit.assurance.picture_looks import KnownLooks, known_looks, measure_looks
 from droguekit.batch.progress import ProgressReport
@@ -196,11 +195,11 @@ def _seen(
             except ValueError as error:
                 unreadable.append(str(error))
             else:
-                pair = StereoImages(picture, picture, time_s=0.0, exposure_s=0.0, encoding="gamma")
-                found = network.candidates(pair, _LEAST_SCORE)["left"]
-                clipped = ((clipped_box(corner_box(one.box_xywh_px), pair.size_px), one.score) for one in found)
+                height, width = picture.shape[:2]
+                found = network.candidates_in_picture(picture, _LEAST_SCORE)
+                clipped = ((clipped_box(corner_box(one.box_xywh_px), (width, height)), one.score) for one in found)
                 boxes = tuple((center_box(box), score) for box, score in clipped if box is not None)
-                seen.append(_Seen(path.relative_to(folder).as_posix(), pair.size_px, measure_looks(picture), boxes))
+                seen.append(_Seen(path.relative_to(folder).as_posix(), (width, height), measure_looks(picture), boxes))
             report.advance()
     finally:
         report.end()

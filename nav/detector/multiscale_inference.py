@@ -1,7 +1,8 @@
-"""Inference at two scales: large drogues from a pass at half the size, all others from the pass at full size.
+"""Inference at several scales: large drogues from passes at half the size, all others from the pass at full size.
 
 A drogue that is nearer than in most training images is larger than the network has learned to detect. At half the size
-it is as large as those that the network detects best.
+it is as large as those that the network detects best. In an image that is larger than those of the training, the
+largest drogues come from a quarter of the size.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ ScoredBoxes = tuple[Array, Array]
 
 # Near the limit the boxes of both passes count, so that no drogue is lost between them.
 _SHARED_FACTOR = 1.25
+_ALL_BOXES = 10_000
 # A box of which more than this lies in a large drogue's box is a part of that drogue, such as a marker.
 _MAX_INSIDE = 0.5
 
@@ -31,14 +33,28 @@ def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
     return width, height
 
 
+def pass_sizes(input_size_px: tuple[int, int], trained_size_px: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+    """Widths and heights of all passes: half of each other, down to half the size of the training or just below.
+
+    Args:
+        input_size_px: width and height of the first pass.
+        trained_size_px: of the images that the network has learned from.
+    """
+    sizes = [input_size_px]
+    while len(sizes) == 1 or max(sizes[-1]) > max(trained_size_px) / 2 + SIZE_STEP_PX:
+        sizes.append(half_size_px(sizes[-1]))
+    return tuple(sizes)
+
+
 def detect_multiscale(
     images: Sequence[NDArray[np.uint8]],
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
     large_from_px: float,
     least_score: float,
     max_boxes: int,
+    passes: int = 2,
 ) -> list[ScoredBoxes]:
-    """Detect drogues in images of one size, with a second pass at half the size where it is asked for.
+    """Detect drogues in images of one size, with passes at half the size where they are asked for.
 
     Args:
         images: (H, W, 3) each, from `nav.detector.input_image`.
@@ -46,13 +62,15 @@ def detect_multiscale(
         large_from_px: see `merge_scales`; 0 for a single pass.
         least_score: boxes with a lower score are left out.
         max_boxes: largest number of boxes of an image.
+        passes: number of passes, each at half the size of the one before.
     """
     full = decode_maps(run(images), least_score)
-    if large_from_px == 0:
+    if large_from_px == 0 or passes == 1:
         return [(boxes[:max_boxes], scores[:max_boxes]) for boxes, scores in full]
     height, width = images[0].shape[:2]
     halves, placements = zip(*(letterbox_image(each, half_size_px((width, height))) for each in images), strict=True)
-    half = map(to_full_size, decode_maps(run(halves), least_score), placements)
+    smaller = detect_multiscale(halves, run, large_from_px, least_score, _ALL_BOXES, passes - 1)
+    half = map(to_full_size, smaller, placements)
     return [merge_scales(*both, large_from_px, max_boxes) for both in zip(full, half, strict=True)]
 
 

@@ -18,9 +18,9 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
-from nav.detector.input_image import input_image, letterbox, network_input
+from nav.detector.input_image import input_image, letterbox, letterbox_image, network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, half_size_px
+from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, pass_sizes
 from nav.detector.output_maps import MAP_CHANNELS, MAX_SIDE_PX, SIZE_STEP_PX, STRIDES
 
 _ORT_ERRORS = (
@@ -29,6 +29,9 @@ _ORT_ERRORS = (
 )  # fmt: skip
 # Errors only: the exception reports a file that cannot be used.
 _LOG_ERRORS = 4
+_MOST_BOXES = 20
+# Longest side of a single picture over that of the images of a pair.
+_MOST_ENLARGED_INPUT = 2
 
 
 class OnnxDetector:
@@ -38,7 +41,7 @@ class OnnxDetector:
         name: how it is called in results.
         metadata: of the file.
         input_size_px: width, height of the network's input. [px]
-        pass_sizes_px: input sizes of all passes for a pair; the second, where the file asks for it, has half the size.
+        pass_sizes_px: input sizes of all passes for a pair; more than one where the file asks for them.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class OnnxDetector:
         self._file = file
         self._session, self._file_bytes = _open_session(file, threads)
         self._input_name, fixed_size = _checked_input(file, self._session)
+        self._least_batch = len(EYES) if self._session.get_inputs()[0].shape[0] == len(EYES) else 1
         self.metadata = _read_metadata(file, self._session, fixed_size)
         self.input_size_px = input_size_px or fixed_size or self.metadata.input_size_px
         if fixed_size and self.input_size_px != fixed_size:
@@ -70,9 +74,8 @@ class OnnxDetector:
             raise ValueError(
                 f"{file}: large_from_px: takes {fixed_size[0]}x{fixed_size[1]} px only, and not half of it"
             )
-        self.pass_sizes_px: tuple[tuple[int, int], ...] = (self.input_size_px,)
-        if self.metadata.large_from_px:
-            self.pass_sizes_px += (half_size_px(self.input_size_px),)
+        self._fixed_size = fixed_size
+        self.pass_sizes_px = self._pass_sizes(self.input_size_px)
         probe = fixed_size or (SIZE_STEP_PX, 2 * SIZE_STEP_PX)
         self._check_maps(self._run(np.zeros((len(EYES), 3, probe[1], probe[0]), np.float32)), probe)
 
@@ -83,7 +86,34 @@ class OnnxDetector:
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        return self._candidates(images, least_score, max_boxes=20)
+        return self._candidates(images, least_score, _MOST_BOXES)
+
+    def candidates_in_picture(self, picture: NDArray[np.uint8], least_score: float) -> tuple[Detection, ...]:
+        """The boxes of a single picture (H, W, 3) or (H, W), the best first, sought at its own size.
+
+        A picture that is larger than the images of a pair is reduced to twice their size at most, a smaller one is
+        enlarged to their size: small drogues need their pixels.
+        """
+        height, width = picture.shape[:2]
+        image, placement = letterbox_image(picture, self._fixed_size or self._picture_size(width, height))
+        # A network whose batch is fixed takes both eyes.
+        ((boxes, scores), *_) = self._detect([image] * self._least_batch, least_score, _MOST_BOXES)
+        return tuple(
+            Detection((x, y, box_width, box_height), score)
+            for (x, y, box_width, box_height), score in zip(
+                placement.to_image(boxes).tolist(), scores.tolist(), strict=True
+            )
+        )
+
+    def _picture_size(self, width: int, height: int) -> tuple[int, int]:
+        widest, most = max(self.input_size_px), min(_MOST_ENLARGED_INPUT * max(self.input_size_px), MAX_SIDE_PX)
+        scale = min(max(width, height, widest), most) / max(width, height)
+        wanted = (max(round(scale * side), 1) for side in (width, height))
+        in_width, in_height = (-(-side // SIZE_STEP_PX) * SIZE_STEP_PX for side in wanted)
+        return in_width, in_height
+
+    def _pass_sizes(self, size_px: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+        return pass_sizes(size_px, self.metadata.input_size_px) if self.metadata.large_from_px else (size_px,)
 
     def _candidates(self, images: StereoImages, least_score: float, max_boxes: int) -> dict[Eye, tuple[Detection, ...]]:
         inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
@@ -101,8 +131,15 @@ class OnnxDetector:
 
     def _detect(self, inputs: Sequence[NDArray[np.uint8]], least_score: float, max_boxes: int) -> list[ScoredBoxes]:
         """For each image the boxes in corner coordinates of the input, and their scores."""
+        height, width = inputs[0].shape[:2]
+        passes = len(self._pass_sizes((width, height)))
         return detect_multiscale(
-            inputs, lambda batch: self._run(network_input(batch)), self.metadata.large_from_px, least_score, max_boxes
+            inputs,
+            lambda batch: self._run(network_input(batch)),
+            self.metadata.large_from_px,
+            least_score,
+            max_boxes,
+            passes,
         )
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:

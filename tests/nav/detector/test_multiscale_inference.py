@@ -10,7 +10,7 @@ import pytest
 from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import letterbox
 from nav.detector.model_metadata import ModelMetadata
-from nav.detector.multiscale_inference import half_size_px, merge_scales, to_full_size
+from nav.detector.multiscale_inference import half_size_px, merge_scales, pass_sizes, to_full_size
 from nav.detector.onnx_detector import OnnxDetector
 from tests.support.detector_networks import write_red_squares
 
@@ -77,6 +77,50 @@ def test_the_second_pass_sees_squares_that_are_twice_as_large(tmp_path: Path) ->
         sides[large_from_px] = min(box.box_xywh_px[2] for box in detector.candidates(images, 0.6)["left"])
     # With a limit of 12 px, boxes of 16 px at full size are not taken from the full-size pass.
     assert sides[0.0] == pytest.approx(16) and sides[12.0] == pytest.approx(32)
+
+
+def test_passes_end_at_half_the_size_of_the_training() -> None:
+    assert pass_sizes((640, 480), (640, 480)) == ((640, 480), (320, 256))
+    assert pass_sizes((1280, 736), (640, 480)) == ((1280, 736), (640, 384), (320, 192))
+    assert pass_sizes((320, 256), (640, 480)) == ((320, 256), (160, 128))
+
+
+def red_square_detector(folder: Path) -> OnnxDetector:
+    metadata = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, large_from_px=12.0)
+    return OnnxDetector(write_red_squares(folder, metadata=metadata))
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 512), (2000, 1500), (100, 70)])
+def test_a_single_picture_is_searched_at_its_own_size(tmp_path: Path, width: int, height: int) -> None:
+    picture = np.full((height, width, 3), 90, np.uint8)
+    low, high = np.array([0.25 * width, 0.25 * height]), np.array([0.75 * width, 0.75 * height])
+    picture[int(low[1]) : int(high[1]), int(low[0]) : int(high[0])] = (255, 0, 0)
+    found = red_square_detector(tmp_path).candidates_in_picture(picture, 0.6)
+    assert found
+    # One cell of the smallest pass, which has at most 320 px, is 8 px there.
+    cell = 8 * max(width, height) / 160
+    for one in found:
+        middle = np.array(one.box_xywh_px[:2]) + np.array(one.box_xywh_px[2:]) / 2
+        assert (middle > low - cell).all() and (middle < high + cell).all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(300, 9000), (5, 400), (1, 1)])
+def test_pictures_of_odd_shapes_are_searched_too(tmp_path: Path, width: int, height: int) -> None:
+    assert red_square_detector(tmp_path).candidates_in_picture(np.full((height, width), 90, np.uint8), 0.6) == ()
+
+
+def test_the_largest_drogues_come_from_the_smallest_pass(tmp_path: Path) -> None:
+    picture = np.full((512, 640, 3), 90, np.uint8)
+    picture[128:384, 128:384] = (255, 0, 0)
+    found = red_square_detector(tmp_path).candidates_in_picture(picture, 0.6)
+    # Two cells of 8 px at a quarter of the size; smaller boxes are not taken from the other passes.
+    assert min(one.box_xywh_px[2] for one in found) == pytest.approx(64)
+
+
+def test_a_network_of_one_size_and_two_images_takes_single_pictures(tmp_path: Path) -> None:
+    detector = OnnxDetector(write_red_squares(tmp_path, shape=(2, 3, 256, 320)))
+    picture = np.full((512, 640), 90, np.uint8)
+    assert detector.candidates_in_picture(picture, 0.6) == ()
 
 
 def test_a_network_of_one_size_cannot_have_a_second_pass(tmp_path: Path) -> None:
