@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,7 +94,12 @@ def resident_gib() -> float:
 
 
 def return_free_memory() -> None:
-    """Give the kernel the free memory between live objects, which the C library keeps: half of a renderer's."""
+    """Give the kernel what no live object needs: half of a renderer's memory.
+
+    These are objects that refer to each other in circles, such as the meshes of trimesh, which Python looks for rarely;
+    and the free memory between live objects, which the C library keeps.
+    """
+    gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it, other libraries have not
     if trim is not None:
         trim(0)

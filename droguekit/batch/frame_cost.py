@@ -38,7 +38,7 @@ PROBES = 5
 _ENOUGH_S = 20.0
 # Fewer cannot separate distance from scene.
 _FEWEST_PROBES = 3
-# The first frames compile kernels; after the farthest and the nearest there are few left to compile.
+# The first frames compile kernels; after a far and a near one there are few left to compile.
 _MOST_WARM_UP = 2
 # Processor time of a far frame above which no near one warms up where kernels are on disk already: it would take
 # several times as long, while the few kernels that are missing take about a second. [s]
@@ -56,7 +56,7 @@ class ProbeFrames:
     Attributes:
         warm_up: made first and not counted: engines compile kernels for new content and keep them on disk. The second
             one is left out where there are kernels on disk and it would take long.
-        counted: the frames from which the cost is estimated: the farthest, the nearest and one without a drogue, then
+        counted: the frames from which the cost is estimated: the farthest, a near one and one without a drogue, then
             those between, from the middle outwards.
         fewest: so many of them are made in any case, the others while they take little time.
     """
@@ -88,8 +88,9 @@ class ProbeResult:
 def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None) -> ProbeFrames:
     """One frame from each of several strata of distance, one without a drogue if there are any, and two to warm up.
 
-    The nearest and the farthest frame are among the counted ones. Within a stratum, families and then scenes that were
-    chosen least often come first.
+    The farthest frame is among the counted ones, and one from the middle of the nearest stratum: the very nearest takes
+    several times as long as most, and stands for few. Within a stratum, families and then scenes that were chosen least
+    often come first.
 
     Args:
         drawn: of the recipe.
@@ -101,7 +102,7 @@ def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None)
     strata: list[NDArray[np.intp]] = np.array_split(
         order, min(PROBES if most is None else most, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order)))
     )
-    ends: list[NDArray[np.intp]] = [order[[-1]], *strata[1:-1], order[[0]]] if len(strata) > 1 else [order]
+    ends: list[NDArray[np.intp]] = [order[[-1]], *strata[1:-1], strata[0]] if len(strata) > 1 else [order]
     empty = np.flatnonzero(np.isnan(drawn.distances_m))[:1]
     counted = _pick_rarest(drawn, [*ends, empty])
     inner = counted[1 : len(ends) - 1]

@@ -30,6 +30,8 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 T = TypeVar("T")
 MAX_ATTEMPTS = 3
 _MOST_OUTPUT = 4000
+# Above `GIB_PER_WORKER` a worker gives memory back when it has grown by this: that takes a tenth of a second.
+_GROWTH_GIB = 0.15
 
 
 _NATIVE_FAULTS = (signal.SIGILL, signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE)
@@ -161,6 +163,7 @@ def _serve(
     except EOFError:
         return
     connection.send(READY)
+    kept_gib = 0.0
     while True:
         try:
             index = connection.recv()
@@ -174,8 +177,9 @@ def _serve(
                 value = then(index, value)
         except Exception as raised:
             value, error = None, _picklable(raised)
-        if resident_gib() > GIB_PER_WORKER:
+        if resident_gib() > max(GIB_PER_WORKER, kept_gib + _GROWTH_GIB):
             return_free_memory()
+            kept_gib = resident_gib()
         connection.send((value, error, resident_gib()))
 
 

@@ -22,6 +22,10 @@ from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import environment_radiance
 
+# New materials need new kernels, some 2 MiB for each frame of a corpus. They stay on disk, and to read them again from
+# there takes less time than can be measured.
+_FRAMES_TO_KEEP_KERNELS = 32
+
 
 class MitsubaEngine:
     """Path tracing of the pixels that see drogue, hose or tanker; all others show the environment itself.
@@ -47,6 +51,7 @@ class MitsubaEngine:
         dr.set_log_level(dr.LogLevel.Error)
         self.variant = chosen
         self._is_noted = False
+        self._frames = 0
         self.version = engine_version(chosen)
         if chosen.variant == "scalar_rgb":
             from render.mitsuba_engine.scalar_tracer import ScalarTracer
@@ -73,6 +78,7 @@ class MitsubaEngine:
 
         # Another engine of this process may have set its own.
         mi.set_variant(self.variant.variant)
+        self._limit_kernels()
         stage_s: dict[str, float] = {}
         started = time.process_time()
         background = backgrounds(frame)
@@ -98,6 +104,15 @@ class MitsubaEngine:
         eyes = {eye: traced.eyes[eye].composite_over(background[eye]) for eye in EYES}
         stage_s["composite"] = time.process_time() - started
         return self._stereo(eyes, noise.fraction, noise.over_sensor, stage_s)
+
+    def _limit_kernels(self) -> None:
+        """Keep memory from growing with the number of frames."""
+        import drjit as dr
+
+        self._frames += 1
+        if self._frames % _FRAMES_TO_KEEP_KERNELS == 0:
+            dr.flush_kernel_cache()
+            dr.flush_malloc_cache()
 
     def _stereo(
         self,

@@ -69,7 +69,9 @@ def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
     distances = drawn.distances_m[list(chosen)]
     shown = distances[np.isfinite(distances)]
     assert len(shown) == 5
-    assert {shown.min(), shown.max()} == {np.nanmin(drawn.distances_m), np.nanmax(drawn.distances_m)}
+    # The nearest one is from the middle of the nearest of five strata.
+    assert shown.max() == np.nanmax(drawn.distances_m)
+    assert 2 * 20**0.06 < shown.min() < 2 * 20**0.14
     # A stratum of five has a factor of 20^(1/5) = 1.82 between its ends, and so have not two of them a gap of two.
     assert (np.diff(np.log(np.sort(shown))) < 2 * np.log(20) / 5).all()
     assert np.bincount(drawn.families[list(chosen)]).tolist() == [3, 3]
@@ -92,7 +94,7 @@ def test_a_near_and_a_far_frame_come_first() -> None:
     assert len(distances) == 2
 
 
-def test_the_ends_and_the_middle_are_probed_in_any_case_and_all_that_are_asked_for() -> None:
+def test_near_far_and_middle_frames_are_probed_in_any_case_and_all_that_are_asked_for() -> None:
     drawn = plan_recipe(build_recipe(BASE)).drawn
     order = choose_probe_frames(drawn, 200)
     distances = drawn.distances_m[[drawn.indices.index(index) for index in order.counted]]
@@ -269,14 +271,13 @@ def test_the_probe_reckons_from_what_it_measures() -> None:
     recipe = parse_recipe(ANALYTIC_RECIPE)
     plan = plan_recipe(recipe)
     found = estimate_cost(recipe, plan, probe_recipe(recipe, plan))
-    order = np.argsort(plan.drawn.distances_m)
-    assert {order[0], order[-1]} < set(found.probed)
+    assert np.argmax(plan.drawn.distances_m) in found.probed
     assert len(found.probed) == 3
     sizes = [report.size_bytes for report in found.probed.values()]
-    # All pairs lie between the nearest and the farthest, and the fit goes through or between the measured sizes.
-    assert 8 * min(sizes) * 0.8 <= found.size_bytes <= 8 * max(sizes) * 1.2
+    # Few pairs are nearer than the nearest measured one, and the fit goes through or between the measured sizes.
+    assert 8 * min(sizes) * 0.8 <= found.size_bytes <= 8 * max(sizes) * 1.3
     slowest_s = max(sum(report.stage_s.values()) for report in found.probed.values())
-    assert 0 < found.frames_s <= 8 * slowest_s * 1.2
+    assert 0 < found.frames_s <= 8 * slowest_s * 1.3
     assert found.start_s > 0
     assert found.drops == ()
 

@@ -278,6 +278,23 @@ print(before_gib - resident_gib())
     assert float(ran.stdout) > 0.15
 
 
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no malloc_trim")
+def test_memory_of_objects_that_refer_to_themselves_goes_back_to_the_kernel() -> None:
+    script = """
+import gc
+from droguekit.batch.execution import resident_gib, return_free_memory
+gc.disable()
+for _ in range(1_000):
+    circle = [bytearray(200_000)]
+    circle.append(circle)
+before_gib = resident_gib()
+return_free_memory()
+print(before_gib - resident_gib())
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert float(ran.stdout) > 0.15
+
+
 def test_a_process_is_replaced_when_it_holds_too_much_memory(tasks: ModuleType) -> None:
     # No Python process is as small as the first limit, and none here as large as the second.
     for limit_gib, processes in ((1e-6, 4), (100.0, 1)):
