@@ -28,10 +28,10 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
-from datasets_manifest.types.records import ViewRecord
+from datasets_manifest.types.records import PixelBox, ViewRecord
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
-from nav.detector.input_image import input_image
+from nav.detector.input_image import Letterbox, input_image
 from nav.training.augmentation import Boxes, Image
 from nav.training.drogue_cutouts import Alpha, Cutout, cut_out
 from nav.training.negative_photographs import Photographs, read_photographs
@@ -268,11 +268,16 @@ def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: Si
         view: ViewRecord = getattr(record.views, eye)
         cutouts.append(cut_out(dataset.part_ids(frame_index, eye), view, placement, input_wh))
         box = view.box_visible_xywh_px
-        boxes.append(None if box is None else tuple(placement.to_input(box)[0].tolist()))
+        boxes.append(None if box is None else _in_input(placement, box))
         beside = [other.box_visible_xywh_px for other in view.neighbours]
-        others.append(tuple(tuple(placement.to_input(box)[0].tolist()) for box in beside if box is not None))
+        others.append(tuple(_in_input(placement, box) for box in beside if box is not None))
     entry = CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1]), others=(others[0], others[1]))
     return _ReadPair(images, cutouts, entry)
+
+
+def _in_input(placement: Letterbox, box: PixelBox) -> PixelBox:
+    x, y, width, height = placement.to_input(np.array(box))[0].tolist()
+    return x, y, width, height
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def pasted_box(box: Boxes, paste: Paste, image_wh: tuple[int, int]) -> Boxes:
     """(1, 4) box of a pasted drogue, clipped to the image, from its box (4,) in its own image. [px]"""
     half = paste.scale * box[2:] / 2
     low, high = np.maximum(paste.center_px - half, 0), np.minimum(paste.center_px + half, image_wh)
-    return np.concatenate([low, high - low])[None]
+    return np.hstack([low, high - low]).reshape(1, 4).astype(np.float64)
 
 
 def paste_drogue(background: Image, image: Image, box: Boxes, cutout: Cutout, alpha: Alpha, paste: Paste) -> Image:
