@@ -31,6 +31,7 @@ _SOFT_EDGE_SIGMA_PX = 0.6
 # The looks: paint and light of the encoded picture, from black to white ones, grey ones and negatives.
 _GAIN, _GAMMA, _SATURATION = (0.3, 1.6), (0.6, 2.0), (0.0, 1.5)
 _GREY_FRACTION, _NEGATIVE_FRACTION = 0.3, 0.1
+_MARGIN_PX = 4  # beside a cut-out, for its soft edge
 _LEAST_CONTRAST_DN = 25.0  # a drogue that would hardly be seen is shown as its negative
 _CLEARANCE = 1.2  # of the boxes of an image, so much times as large, a pasted drogue touches none
 
@@ -170,18 +171,23 @@ def paste_drogue(background: Image, image: Image, box: Boxes, cutout: Cutout, al
         pixels = np.asarray(cv2.resize(pixels, wanted, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         opacity = np.asarray(cv2.resize(opacity, wanted, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     scale = paste.scale * np.array([cutout.width / pixels.shape[1], cutout.height / pixels.shape[0]])
-    # OpenCV counts from pixel centres.
     corner = paste.center_px + paste.scale * (np.array([cutout.x, cutout.y]) - box[:2] - box[2:] / 2)
-    shift = corner + scale / 2 - 0.5
-    warp = np.column_stack([np.diag(scale), shift])
-    size = background.shape[1::-1]
+    result = background.copy()
+    low = np.maximum(np.floor(corner).astype(int) - _MARGIN_PX, 0)
+    high = np.ceil(corner + paste.scale * np.array([cutout.width, cutout.height])).astype(int) + _MARGIN_PX
+    part = result[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
+    if not part.size:
+        return result
+    # OpenCV counts from pixel centres.
+    warp, size = np.column_stack([np.diag(scale), corner - low + scale / 2 - 0.5]), part.shape[1::-1]
     shown = cv2.warpAffine(pixels, warp, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     cover = cv2.GaussianBlur(cv2.warpAffine(opacity, warp, size), (0, 0), _SOFT_EDGE_SIGMA_PX)
     weight = (cover / np.float32(255))[..., None]
-    difference = weight * (shown - background.astype(np.float32))
+    difference = weight * (shown - part.astype(np.float32))
     if np.abs(difference).sum() < _LEAST_CONTRAST_DN * max(float(weight.sum()) * 3, 1.0):
-        difference = weight * (255 - shown - background.astype(np.float32))
-    return np.asarray(np.rint(background + difference), dtype=np.uint8)
+        difference = weight * (255 - shown - part.astype(np.float32))
+    part[:] = np.rint(part + difference)
+    return result
 
 
 def _repaint(pixels: Image, look: Look) -> Image:

@@ -45,7 +45,8 @@ def test_a_network_says_where_it_comes_from(name: str) -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_no_test_scene_is_one_that_was_learned(name: str) -> None:
     # Scenes follow from a recipe's seed and their number.
-    learned = {load_recipe(corpus["name"]).recipe.seed for corpus in shipped(name).metadata.training["datasets"]}
+    datasets = [corpus for corpus in shipped(name).metadata.training["datasets"] if corpus["name"] != "photographs"]
+    learned = {load_recipe(corpus["name"]).recipe.seed for corpus in datasets}
     assert load_recipe("detector-test").recipe.seed not in learned
 
 
