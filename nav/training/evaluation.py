@@ -211,7 +211,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
     determine one threshold: many differ from the best by no more than chance, and the middle of their range is taken.
 
     Args:
-        truth: for each image (n, 4) boxes, n 0 or 1.
+        truth: for each image (n, 4) boxes of all drogues in it.
         found: for each image (m, 4) boxes and (m,) scores, the best first.
         otherwise: the threshold where no prediction is right.
 
@@ -219,7 +219,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
         The middle between the highest and the lowest of those thresholds.
     """
     best = [
-        (float(scores[0]), len(own) > 0, len(own) > 0 and intersection_over_union(own[0], boxes[0]) >= _MIN_IOU)
+        (float(scores[0]), len(own) > 0, bool((intersection_over_union(own, boxes[0]) >= _MIN_IOU).any()))
         for own, (boxes, scores) in zip(truth, found, strict=True)
         if len(scores)
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -181,11 +181,14 @@ def _evaluate_and_export(
     for each in (network, state.average.network):
         measure_batch_statistics(each, corpus, size, exact)
 
-    def predictions(split: SplitName) -> Predictions:
-        return predict(network, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
+    def predictions(split: SplitName, of: DetectorNetwork = network) -> Predictions:
+        return predict(of, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
 
     validation, test = predictions("val"), predictions("test")
-    threshold = best_threshold(validation.truth, validation.found, _DEFAULT_THRESHOLD)
+    last_validation = predictions("val", state.average.network)
+    threshold, last_threshold = (
+        best_threshold(each.truth, each.found, _DEFAULT_THRESHOLD) for each in (validation, last_validation)
+    )
     result = TrainingResult(
         out / ONNX_FILE,
         best_step,
@@ -194,20 +197,32 @@ def _evaluate_and_export(
         threshold,
         corpus.fault,
     )
-    table = _result_table(result, corpus, settings)
-    write_text_atomic(out / RESULT_FILE, json.dumps(table, indent=1) + "\n")
-    metadata = ModelMetadata(
-        input_size_px=(size[1], size[0]),
-        score_threshold=threshold,
+    write_text_atomic(out / RESULT_FILE, json.dumps(_result_table(result, corpus, settings), indent=1) + "\n")
+    last = replace(
+        result,
+        best_step=state.step,
+        validation=average_precision(last_validation.truth, last_validation.found),
+        test=None,
+        score_threshold=last_threshold,
+    )
+    export_onnx(network, out / ONNX_FILE, _metadata(result, corpus, settings, network))
+    export_onnx(state.average.network, out / LAST_ONNX_FILE, _metadata(last, corpus, settings, network))
+    return result
+
+
+def _metadata(
+    result: TrainingResult, corpus: Corpus, settings: TrainingSettings, network: DetectorNetwork
+) -> ModelMetadata:
+    height_px, width_px = settings.size_at(settings.steps - 1)
+    return ModelMetadata(
+        input_size_px=(width_px, height_px),
+        score_threshold=result.score_threshold,
         large_from_px=settings.large_from_px,
         licence=settings.licence,
         manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.caches) == 1 else "",
         network=network.config.to_dict(),
-        training=table,
+        training=_result_table(result, corpus, settings),
     )
-    export_onnx(network, out / ONNX_FILE, metadata)
-    export_onnx(state.average.network, out / LAST_ONNX_FILE, metadata)
-    return result
 
 
 def _best_network(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:

@@ -43,6 +43,11 @@ def test_the_threshold_separates_right_boxes_from_wrong_ones() -> None:
     assert best_threshold(truth, [NONE] * 4, 0.1) == 0.1
 
 
+def test_the_best_box_may_be_that_of_any_drogue_in_the_image() -> None:
+    two = np.vstack([BOX + np.array([50, 0, 0, 0]), BOX])
+    assert best_threshold([two, BOX], [found(0.7), found(0.9)], 0.1) == pytest.approx(0.35)
+
+
 def test_the_threshold_is_the_middle_of_those_that_differ_by_chance() -> None:
     empty = np.zeros((0, 4))
     # Nine drogues are found, then wrong and right boxes alternate, and one drogue is missed. From the eighth box on,
