@@ -22,7 +22,7 @@ ScoredBoxes = tuple[Array, Array]
 
 # Near the limit the boxes of both passes count, so that no drogue is lost between them.
 _SHARED_FACTOR = 1.25
-_ALL_BOXES = 10_000
+_ALL_BOXES = 10_000  # of a smaller pass, before it is merged
 # A box of which more than this lies in a large drogue's box is a part of that drogue, such as a marker.
 _MAX_INSIDE = 0.5
 

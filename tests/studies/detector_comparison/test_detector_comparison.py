@@ -67,6 +67,9 @@ def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+TWO_PEERS = ("yolov8s", "yolov8n")
+
+
 def order(corpus: Path, folder: Path, **changes: object) -> ComparisonOptions:
     values: dict[str, object] = {
         "corpus": corpus,
@@ -80,7 +83,7 @@ def order(corpus: Path, folder: Path, **changes: object) -> ComparisonOptions:
         "device": "cpu",
         "seed": 0,
         "environment": folder / "environment",
-        "peers": ("yolov8s", "yolov8n"),
+        "peers": TWO_PEERS,
     }
     return ComparisonOptions(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -240,14 +243,14 @@ def test_trained_peers_are_timed_and_scored_by_the_benchmark(screen_dataset: Pat
     told: list[str] = []
     found = compare_peers(order(screen_dataset, tmp_path), out, told.append)
     assert not any("training" in line or "installing" in line for line in told)
-    files = [word for name in PEERS for word in ("--detections", str(out / "detections" / f"{name}.json"))]
+    files = [word for name in TWO_PEERS for word in ("--detections", str(out / "detections" / f"{name}.json"))]
     words = ["benchmark", str(screen_dataset), *files, "--split", "test", "--json", str(tmp_path / "scores.json")]
     assert run(words) == DONE
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["dataset"]["images"] == len(truth) == 4
     table = json.loads((out / "comparison.json").read_text())
-    assert list(table["detectors"]) == list(PEERS) and table["order"]["peer_image_passes"] == "100"
-    for name in PEERS:
+    assert list(table["detectors"]) == list(TWO_PEERS) and table["order"]["peer_image_passes"] == "100"
+    for name in TWO_PEERS:
         row, overall = table["detectors"][name], scores["detectors"][name]["overall"]
         assert row == json.loads(json.dumps(found[name]))
         assert {key: row[key] for key in ("ap", "ap50", "ap75", "recall")} == {
