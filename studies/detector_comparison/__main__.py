@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -100,6 +100,8 @@ class ComparisonOptions:
                 "image_passes, batch, threads, rounds: must be positive, got "
                 f"{self.image_passes}, {self.batch}, {self.threads}, {self.rounds}"
             )
+        if unknown := [name for name in self.peers if name not in PEERS]:
+            raise ValueError(f"--peer: must be one of {', '.join(PEERS)}, got {', '.join(unknown)}")
         if any(side < 32 or side % 32 for side in self.size_px):
             raise ValueError(f"size: must be multiples of 32 px, got {self.size_px[1]}x{self.size_px[0]}")
 
@@ -314,8 +316,8 @@ def main(
         ),
     ] = None,
     peer: Annotated[
-        list[Literal["yolov8s", "yolov8n", "yolo11n", "yolo12n", "yolo26n"]] | None,
-        typer.Option("--peer", help="Repeatable; all by default."),
+        list[str] | None,
+        typer.Option("--peer", metavar="NAME", help=f"{', '.join(PEERS)}. Repeatable; all by default."),
     ] = None,
 ) -> None:
     """Train networks of ultralytics from scratch, time all detectors in turns, and score them by our benchmark.

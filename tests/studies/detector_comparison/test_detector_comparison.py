@@ -310,6 +310,14 @@ def test_options_out_of_range_are_refused(tmp_path: Path, changes: dict[str, obj
         order(tmp_path, tmp_path, **changes)
 
 
+def test_unknown_peers_are_refused_and_all_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"--peer: must be one of yolov8s, .*, yolo26n, got yolo3, yolo4"):
+        order(tmp_path, tmp_path, peers=("yolo3", "yolov8n", "yolo4"))
+    command = [sys.executable, "-m", "studies.detector_comparison", "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
+    assert "--peer" in shown.stdout
+
+
 def test_sizes_have_their_height_first_and_are_multiples_of_32(tmp_path: Path) -> None:
     assert input_size_px("480x640") == (640, 480)
     for text in ("480", "480x", "axb", "-32x64", "9" * 20):
