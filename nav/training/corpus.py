@@ -176,7 +176,9 @@ def _read(cache_folder: Path, dataset: Dataset, size_px: SizePx) -> ImageCache |
     except (OSError, ValueError, EOFError):
         return None
     wanted = (_VERSION, dataset.manifest.dataset_sha256, size_px)
-    is_whole = images.shape == (len(index.pairs), 2, *size_px, 3) and images.dtype == np.uint8
+    ends = [cut.offset + cut.width * cut.height for pair in index.pairs for cut in pair.cutouts if cut is not None]
+    is_whole = images.shape == (len(index.pairs), 2, *size_px, 3) and opacities.shape == (max(ends, default=0),)
+    is_whole &= images.dtype == opacities.dtype == np.uint8
     is_wanted = (index.version, index.dataset_sha256, index.size_px) == wanted
     if not (is_whole and is_wanted):
         return None

@@ -1,1 +1,1 @@
-"""Our detectors beside YOLOv8 of ultralytics: same corpus, same image passes, same input, timed in turns."""
+"""Our detectors beside those of ultralytics: same corpus, same image passes, same input, timed in turns."""

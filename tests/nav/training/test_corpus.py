@@ -60,6 +60,13 @@ def test_a_cache_is_used_again_and_a_damaged_one_is_made_again(split_dataset: Pa
     for damaged in (content[: len(content) // 2], b"", b"\x93NUMPY"):
         images.write_bytes(damaged)
         np.testing.assert_array_equal(open_small([split_dataset], tmp_path).caches[0].images, expected)
+    (opacities,) = tmp_path.glob("*/opacities.npy")
+    longer = np.append(first.caches[0].opacities, np.zeros(5, np.uint8))
+    for wrong in (longer, longer[:-5].astype(np.float32)):
+        np.save(opacities, wrong)
+        found = open_small([split_dataset], tmp_path).caches[0].opacities
+        np.testing.assert_array_equal(found, first.caches[0].opacities)
+        assert found.dtype == np.uint8
     assert not list(tmp_path.glob("*.part"))
 
 

@@ -66,8 +66,10 @@ def test_a_pasted_drogue_lies_in_its_box(scale: float, center: tuple[float, floa
     covered = shown[..., 0] > 60
     rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
     seen = [columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]]
+    # OpenCV's ellipse and half the contrast are off by up to half a pixel on either side, which is enlarged 1.5 times.
     np.testing.assert_allclose(seen, pasted_box(box, paste, (128, 96))[0], atol=1.5)
     middle = shown[round(center[1]), round(center[0])]
+    # Colour curve, warp and blend round once each.
     np.testing.assert_allclose(middle, 0.8 * np.array([250, 200, 150]), atol=2)
 
 
