@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-device bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-device bench-variety bench-detectors detector-weights bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -83,6 +83,10 @@ CORPUS ?= out/detector/datasets/detector-small
 bench-detectors: ## detectors OURS=FILE.onnx beside five of ultralytics, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
+
+detector-weights: ## photographs, corpus and training of the shipped mobile-l, and its scores (hours; Debian 12; resumes)
+	@scripts/setup all
+	@$(BIN)/python -m studies.detector_weights --out out/detector-weights
 
 bench: ## CPU seconds per stereo pair by distance and stage, and pairs per second of all workers
 	@scripts/setup mitsuba

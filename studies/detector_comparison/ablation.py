@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +34,7 @@ from studies.detector_comparison.options import (
     input_size_px,
     print_status,
 )
+from studies.droguekit_command import run_droguekit
 
 
 class SingleViewDetector(OnnxDetector):
@@ -96,7 +94,6 @@ LEARNING: dict[str, dict[str, Any]] = {
     "all-mosaic": {"mosaic_fraction": 1.0},
 }
 CHANGES = PARTS | LEARNING
-_INTERRUPTED = 130
 _TIMED_PAIRS = 4
 
 
@@ -248,21 +245,8 @@ def _train(options: AblationOptions, folder: Path, changes: Mapping[str, Any], s
     say(f"{folder.parent.name}, {folder.name}: training, unless it is complete; {folder / 'train.log'}")
     folder.mkdir(parents=True, exist_ok=True)
     write_text_atomic(folder / "ablation.toml", settings_text(changes))
-    words = [str(word) for argument in arguments.items() for word in argument]
-    with (folder / "train.log").open("a", encoding="utf-8") as log:
-        ended = subprocess.run(
-            # -P: a file in the working folder must not replace a module of ours.
-            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(options.corpus), *words],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-            check=False,
-        )
-    if ended.returncode == _INTERRUPTED:
-        raise OSError(f"{folder}: the training was interrupted; the same command resumes it")
-    if ended.returncode != 0:
-        said = (folder / "train.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        raise OSError(f"{folder / 'train.log'}: {said[-1] if said else 'the training failed silently'}")
+    words = [word for argument in arguments.items() for word in argument]
+    run_droguekit("train", options.corpus, *words, log=folder / "train.log")
 
 
 _EXAMPLES = """Examples:

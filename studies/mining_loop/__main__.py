@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +17,7 @@ from droguekit.scoring.detection.detection_metrics import Evaluation
 from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
 from droguekit.scoring.results.detection_result import DetectedBox, image_id_of, read_detections
 from geometry.se3 import Array
+from studies.droguekit_command import run_droguekit
 
 RECIPE = Path(__file__).with_name("loop.toml")
 ARMS = ("even", "mined")
@@ -27,19 +25,6 @@ EDGES_M = (2.0, 8.0, 16.0, 28.0, 40.0)
 # Student's t for the 95 % interval of the mean, by the number of seeds.
 _T_975 = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}
 _FAMILIES = ("day", "low-sun", "dusk", "haze")
-
-
-def droguekit(*words: object, log: Path) -> None:
-    """Run a command of droguekit, as a user does.
-
-    Raises:
-        OSError: it failed; names the log.
-    """
-    with log.open("a", encoding="utf-8") as lines:
-        command = [sys.executable, "-P", "-m", "droguekit.cli.main", *map(str, words)]
-        ended = subprocess.run(command, stdout=lines, stderr=subprocess.STDOUT, env=dict(os.environ), check=False)
-    if ended.returncode != 0:
-        raise OSError(f"{log}: droguekit {words[0]} ended with {ended.returncode}")
 
 
 def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
@@ -59,7 +44,7 @@ def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
     for name, text in texts.items():
         recipe = out / f"{name}.toml"
         write_text_atomic(recipe, text)
-        droguekit("render", recipe, "--out", out / name, "--workers", workers, log=out / "render.log")
+        run_droguekit("render", recipe, "--out", out / name, "--workers", workers, log=out / "render.log")
 
 
 def train_and_detect(
@@ -76,9 +61,9 @@ def train_and_detect(
         if start is not None:
             words += ["--start-from", start]
         log = folder / "train.log"
-        droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
+        run_droguekit("train", *sources, "--out", folder, "--cache", out / "cache", *words, log=log)
         found = folder / "detector.onnx"
-        droguekit("detect", out / dataset, "--detector", found, "--out", boxes, log=log)
+        run_droguekit("detect", out / dataset, "--detector", found, "--out", boxes, log=log)
     return boxes
 
 
@@ -86,7 +71,7 @@ def detected(out: Path, detector: str, dataset: str) -> Path:
     """Boxes of a shipped detector in a dataset, found unless they are there."""
     boxes = out / f"{dataset}-{detector}.json"
     if not boxes.is_file():
-        droguekit("detect", out / dataset, "--detector", detector, "--out", boxes, log=out / "mine.log")
+        run_droguekit("detect", out / dataset, "--detector", detector, "--out", boxes, log=out / "mine.log")
     return boxes
 
 
@@ -170,11 +155,13 @@ def main(
             trial = train_and_detect(out, "first", ["first"], "trial", image_passes, 0)
         else:
             trial = detected(out, start_from, "trial")
-        droguekit("mine", out / "trial", "--detections", trial, "--kept", kept, "--count", 150, "--out", mined, log=log)
+        run_droguekit(
+            "mine", out / "trial", "--detections", trial, "--kept", kept, "--count", 150, "--out", mined, log=log
+        )
         # As many scenes as the even corpus has: scenes teach more than pairs of one scene.
         asked = re.sub(r"(?m)^scenes = \d+", "scenes = 75", mined.read_text(encoding="utf-8"))
         write_text_atomic(mined, asked)
-        droguekit("render", mined, "--out", out / name, "--workers", workers, log=out / "render.log")
+        run_droguekit("render", mined, "--out", out / name, "--workers", workers, log=out / "render.log")
         scores: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
         whole: dict[str, list[float]] = {arm: [] for arm in ARMS}
         truth = read_detection_truth(out / "test")

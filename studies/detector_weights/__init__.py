@@ -1,0 +1,1 @@
+"""Makes the shipped detectors anew: photographs, corpora, trainings, scores and hashes."""
