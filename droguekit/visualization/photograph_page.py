@@ -85,7 +85,7 @@ def _tile(folder: Path, one: PhotographResult) -> _Tile:
         rgb = FOUND_RGB if found.is_true is None else HIT_RGB if found.is_true else FALSE_RGB
         draw_box(tile, found.box_xywh_px, scale, color=rgb, line_px=_LINE_PX)
     scores = ", ".join(f"{found.score:.2f}" for found in one.found)
-    words = [f"scores {scores}" if scores else "no box"]
+    words = [f"{'score' if len(one.found) == 1 else 'scores'} {scores}" if scores else "no box"]
     if one.family is not None:
         words.append(f"like {one.family}" if one.difference is None else f"not covered: {one.difference}")
     return _Tile(jpeg_uri(tile), tile.shape[1], tile.shape[0], one.name, "; ".join(words))
