@@ -12,8 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
+from geometry.compiled_loops import compiled
 from scenes.atmosphere.air_layers import (
     EARTH_M,
     REPEATED_FIRST,
@@ -81,10 +81,23 @@ class ScatteredLight:
     moments: Array
     ground: Array
 
-    def at(self, height_m: Array, sun_sine: Array) -> Array:
-        """(N, 6, L) moments at (N,) heights and sines of the sun's elevation."""
-        moved: Array = grid_weights(height_m, sun_sine) @ self.moments.reshape(self.moments.shape[0], -1)
-        return moved.reshape(len(height_m), _MOMENTS, -1)
+    def add_into_rays(
+        self,
+        light: Array,
+        height_m: Array,
+        sun_sine: Array,
+        scattered: tuple[Array, Array],
+        ray_up: Array,
+        ray_level: Array,
+    ) -> None:
+        """Add to (N, L) `light` of rays what this light adds to it in a step of theirs.
+
+        Args:
+            light: is changed.
+            height_m, sun_sine: (N,) of the step's middle, as in `grid_places`.
+            scattered, ray_up, ray_level: as in `add_scattered`.
+        """
+        add_scattered(light, self.moments, grid_places(height_m, sun_sine), scattered, ray_up, ray_level)
 
     def ground_at(self, sun_sine: float) -> Array:
         """(L,) illuminance of level ground under a sun of that sine of elevation."""
@@ -94,16 +107,15 @@ class ScatteredLight:
         return result
 
 
-def grid_weights(height_m: Array, sun_sine: Array) -> csr_matrix:
-    """(N, H S) weights of the grid's nodes in linear interpolation at (N,) heights and sines of the sun's elevation."""
+def grid_places(height_m: Array, sun_sine: Array) -> tuple[NDArray[np.intp], Array]:
+    """Nodes of the grid around (N,) heights and sines of the sun's elevation: (N, 4) indices, and their shares."""
     sun_deg = np.degrees(np.arcsin(np.clip(sun_sine, -1.0, 1.0)))
     row, down = _place(_HEIGHTS_M, height_m)
     column, right = _place(_SUN_DEG, sun_deg)
     node = row * len(_SUN_DEG) + column
     nodes = np.stack([node, node + 1, node + len(_SUN_DEG), node + len(_SUN_DEG) + 1], axis=-1)
     shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=-1)
-    ends = np.arange(len(height_m) + 1) * 4
-    return csr_matrix((shares.ravel(), nodes.ravel(), ends), shape=(len(height_m), len(_HEIGHTS_M) * len(_SUN_DEG)))
+    return nodes, shares
 
 
 def _place(nodes: Array, value: Array) -> tuple[NDArray[np.intp], Array]:
@@ -115,39 +127,57 @@ def _place(nodes: Array, value: Array) -> tuple[NDArray[np.intp], Array]:
 
 @dataclass(frozen=True, eq=False)
 class _RaySteps:
-    """One step along all rays.
+    """One step along all rays; attributes as in `add_scattered`."""
 
-    Attributes:
-        weights: of the grid's nodes in the middle of the step.
-        scattered, up, level: as in `source`.
-    """
-
-    weights: csr_matrix
+    places: tuple[NDArray[np.intp], Array]
     scattered: tuple[Array, Array]
-    up: Array
-    level: Array
+    ray_up: Array
+    ray_level: Array
 
 
-def source(moments: Array, scattered: tuple[Array, Array], up: Array, level: Array) -> Array:
-    """(N, L) light that reaches the start of rays from a step of theirs, of light that was scattered before.
+@compiled
+def add_scattered(
+    light: Array,
+    moments: Array,
+    places: tuple[NDArray[np.intp], Array],
+    scattered: tuple[Array, Array],
+    ray_up: Array,
+    ray_level: Array,
+) -> None:
+    """Add to the light at the start of rays what a step of theirs scatters of light that was scattered before.
 
     Args:
-        moments: (N, 6, L) of that light, as in `ScatteredLight`.
+        light: (N, L), is changed.
+        moments: (H S, 6, L) of the light that was scattered before, as in `ScatteredLight`.
+        places: of the step's middle, as of `grid_places`.
         scattered: (N, L) share of it that molecules and aerosol scatter into the ray, times 4 pi over their phase
             functions.
-        up, level: (N,) components of the rays' directions there, along the vertical, and level towards the sun.
+        ray_up, ray_level: (N,) components of the rays' directions there, along the vertical, and level towards the sun.
     """
-    mean, of_up, of_level, up_up, up_level, level_level = np.moveaxis(moments, 1, 0)
-    up, level = up[:, None], level[:, None]
-    # By Legendre polynomials of the angle between where light comes from and where the ray looks.
-    first = of_up * up + of_level * level
-    aside = 1.0 - up * up - level * level
-    square = up_up * (up * up - aside) + level_level * (level * level - aside) + 2.0 * up_level * (up * level)
-    second = 1.5 * (square + aside * mean) - 0.5 * mean
+    nodes, shares = places
     molecules, aerosol = scattered
-    of_aerosol = mean + 3.0 * REPEATED_FIRST * first + 5.0 * REPEATED_SECOND * second
-    result: Array = molecules * (mean + 0.5 * second) + aerosol * np.maximum(of_aerosol, _LEAST_SHARE * mean)
-    return result
+    wavelengths = light.shape[1]
+    # Loops over wavelengths are innermost, where the processor takes several at a time.
+    there = np.empty((_MOMENTS, wavelengths))
+    for ray in range(light.shape[0]):
+        there[:] = 0.0
+        for corner in range(4):
+            node, share = nodes[ray, corner], shares[ray, corner]
+            for moment in range(_MOMENTS):
+                for k in range(wavelengths):
+                    there[moment, k] += share * moments[node, moment, k]
+        up, level = ray_up[ray], ray_level[ray]
+        aside = 1.0 - up * up - level * level
+        for k in range(wavelengths):
+            mean = there[0, k]
+            # By Legendre polynomials of the angle between where light comes from and where the ray looks.
+            first = there[1, k] * up + there[2, k] * level
+            square = there[3, k] * (up * up - aside) + there[5, k] * (level * level - aside)
+            square += 2.0 * there[4, k] * (up * level)
+            second = 1.5 * (square + aside * mean) - 0.5 * mean
+            of_aerosol = mean + 3.0 * REPEATED_FIRST * first + 5.0 * REPEATED_SECOND * second
+            aerosol_part = aerosol[ray, k] * max(of_aerosol, _LEAST_SHARE * mean)
+            light[ray, k] += molecules[ray, k] * (mean + 0.5 * second) + aerosol_part
 
 
 @lru_cache(maxsize=32)
@@ -187,18 +217,25 @@ def scattered_light(layers: AirLayers) -> ScatteredLight:
         before += here
         steps.append(
             _RaySteps(
-                weights=grid_weights(there_m, sun_there),
+                places=grid_places(there_m, sun_there),
                 scattered=(by_each[0], by_each[1]),
-                up=up,
-                level=(towards_sun - sun_there * up) / np.sqrt(np.maximum(1.0 - sun_there**2, 1e-9)),
+                ray_up=up,
+                ray_level=(towards_sun - sun_there * up) / np.sqrt(np.maximum(1.0 - sun_there**2, 1e-9)),
             )
         )
     reflects = falls[:, None] * np.exp(-before) * spectrum_of_rgb(np.array(layers.ground_rgb)) / np.pi
     sun_at_ground = np.clip((radius * sun_sine + length_m * towards_sun) / EARTH_M, -1.0, 1.0)
-    on_ground = grid_weights(np.zeros(len(height_m)), sun_at_ground)[:, :suns]
+    # At the lowest height only the first two nodes have a share.
+    ground_nodes, ground_shares = grid_places(np.zeros(len(height_m)), sun_at_ground)
+
+    def on_ground(of_suns: Array) -> Array:
+        left, right = (ground_shares[:, k, None] * of_suns[ground_nodes[:, k]] for k in range(2))
+        both: Array = left + right
+        return both
+
     at_nodes = np.sin(np.radians(_SUN_DEG))
     direct = np.maximum(at_nodes, 0.0)[:, None] * layers.sunlight(np.zeros(suns), at_nodes)
-    light += reflects * (on_ground @ direct)
+    light += reflects * on_ground(direct)
 
     up, level = ray_sine.reshape(shape), level.reshape(shape)
     components = np.stack([np.ones(shape), up, level, up * up, up * level, level * level])
@@ -214,11 +251,9 @@ def scattered_light(layers: AirLayers) -> ScatteredLight:
     moments, ground = moments_of(light)
     total, total_ground, last = moments.copy(), ground.copy(), moments
     for _ in range(2, _ORDERS + 1):
-        light = reflects * (on_ground @ ground)
-        flat = moments.reshape(moments.shape[0], -1)
+        light = reflects * on_ground(ground)
         for step in steps:
-            there = (step.weights @ flat).reshape(len(height_m), _MOMENTS, -1)
-            light += source(there, step.scattered, step.up, step.level)
+            add_scattered(light, moments, step.places, step.scattered, step.ray_up, step.ray_level)
         last = moments
         moments, ground = moments_of(light)
         total += moments

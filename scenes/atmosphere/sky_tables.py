@@ -29,7 +29,7 @@ from scenes.atmosphere.air_layers import (
     rayleigh_phase,
     rgb_of_spectrum,
 )
-from scenes.atmosphere.multiple_scattering import scattered_light, source
+from scenes.atmosphere.multiple_scattering import scattered_light
 
 _ROWS, _COLUMNS, _SKY_STEPS = 40, 25, 40
 _DISTANCE_M = 1e3 * np.array(
@@ -217,7 +217,7 @@ class _March:
         molecules, aerosol = (np.outer(density[k], self._layers.scattered[k]) * passed for k in range(2))
         sunlight = self._layers.sunlight(there_m, sun_there)
         self.smooth += molecules * sunlight * self._molecules
-        self.smooth += source(self._scattered.at(there_m, sun_there), (molecules, aerosol), up, level)
+        self._scattered.add_into_rays(self.smooth, there_m, sun_there, (molecules, aerosol), up, level)
         self.peaked += aerosol * sunlight
 
     def light_rgb(self) -> Table:
