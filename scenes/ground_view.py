@@ -192,27 +192,30 @@ def _add_samples(
     side, top, byte_levels = sizes
     x_m, y_m, along_x_m, along_y_m, width_m = lines
     channels = sums.shape[1]
+    # Where each level begins among those of its kind, and its share of the finest one's side.
+    starts, scales = np.zeros(top + 2, np.int64), np.ones(top + 2, np.float64)
+    for number in range(1, top + 2):
+        scales[number] = 0.5 * scales[number - 1]
+        if number != byte_levels:
+            starts[number] = starts[number - 1] + (side >> (number - 1)) * (side >> (number - 1)) * channels
+    level = 0.0
     for index in range(sums.shape[0]):
-        width = float(width_m[index if width_m.size > 1 else 0])
+        if index == 0 or width_m.size > 1:
+            level = min(max(np.log2(max(float(width_m[index]), 1e-3) / texel_m), 0.0), float(top))
         x, y = float(x_m[index if x_m.size > 1 else 0]), float(y_m[index if y_m.size > 1 else 0])
         along = index if along_x_m.size > 1 else 0
-        level = min(max(np.log2(max(width, 1e-3) / texel_m), 0.0), float(top))
         for place in range(places):
             step = (place + 0.5) / places - 0.5
             u, v = (x + step * along_x_m[along]) / texel_m, (y + step * along_y_m[along]) / texel_m
-            for which in range(2):
-                number = int(level) + which
+            for number in range(int(level), int(level) + 2):
                 weight = (1.0 - abs(level - number)) / places
                 if weight <= 0.0:
                     continue
-                start, scale = 0, 0.5**number
-                for finer in range(0 if number < byte_levels else byte_levels, number):
-                    start += (side >> finer) * (side >> finer) * channels
-                at = u * scale - 0.5, v * scale - 0.5
+                at = u * scales[number] - 0.5, v * scales[number] - 0.5
                 if number < byte_levels:
-                    _add_level(roots, start, side >> number, at, weight, sums, index)
+                    _add_level(roots, starts[number], side >> number, at, weight, sums, index)
                 else:
-                    _add_level(values, start, side >> number, at, weight, sums, index)
+                    _add_level(values, starts[number], side >> number, at, weight, sums, index)
 
 
 @dataclass(frozen=True, eq=False)
