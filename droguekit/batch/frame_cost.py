@@ -24,7 +24,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import Drop
 from datasets_manifest.storage.reader import read_record_table
-from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop, process_engine, render_frame
+from droguekit.batch.frame_task import FATAL_ERRORS, FrameReport, FrameTask, make_drop
 from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan, family_index
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array
@@ -38,10 +38,8 @@ PROBES = 5
 _ENOUGH_S = 20.0
 # Fewer cannot separate distance from scene.
 _FEWEST_PROBES = 3
-# The first frames compile kernels; after a far and a near one there are few left to compile.
-_MOST_WARM_UP = 2
-# Processor time of a far frame above which no near one warms up where kernels are on disk already: it would take
-# several times as long, while the few kernels that are missing take about a second. [s]
+# Processor time of the first frame above which it alone warms up where kernels are on disk already: a near frame would
+# take several times as long, while to load the kernels that are missing takes about a second. [s]
 _LONG_WARM_UP_S = 2.0
 # Constant, inverse and inverse square of the distance.
 _TERMS = 3
@@ -54,10 +52,10 @@ class ProbeFrames:
     """The frames that a probe makes.
 
     Attributes:
-        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk. The second
-            one is left out where there are kernels on disk and it would take long.
-        counted: the frames from which the cost is estimated: the farthest, a near one and one without a drogue, then
-            those between, from the middle outwards.
+        warm_up: a far and a near one, made before the counted ones: engines compile kernels for new content and keep
+            them on disk. They are left out where there are kernels on disk and frames take long.
+        counted: the frames from which the cost is estimated: one without a drogue, the farthest and a near one, then
+            those between, from the middle outwards. The first one is made twice, and counts the second time.
         fewest: so many of them are made in any case, the others while they take little time.
     """
 
@@ -71,7 +69,7 @@ class ProbeResult:
     """What the probed frames cost.
 
     Attributes:
-        warm_up: frames made before the others.
+        warm_up: frames made before the others; the first of them was made again and counts too.
         counted: frames from which the cost is estimated.
         later_scene_s: processor time of a frame in the stages that make its scene, when the scene exists. [s]
         start_cpu_s: processor time of the process outside the frames. [s]
@@ -86,7 +84,7 @@ class ProbeResult:
 
 
 def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None) -> ProbeFrames:
-    """One frame from each of several strata of distance, one without a drogue if there are any, and two to warm up.
+    """One frame without a drogue if there are any, one from each of several strata of distance, and two to warm up.
 
     The farthest frame is among the counted ones, and one from the middle of the nearest stratum: the very nearest takes
     several times as long as most, and stands for few. Within a stratum, families and then scenes that were chosen least
@@ -107,10 +105,15 @@ def choose_probe_frames(drawn: DrawnFrames, count: int, most: int | None = None)
     counted = _pick_rarest(drawn, [*ends, empty])
     inner = counted[1 : len(ends) - 1]
     middle_first = sorted(range(len(inner)), key=lambda k: abs(2 * k - len(inner) + 1))
-    counted = [*counted[:1], *counted[1 + len(inner) :], *(inner[k] for k in middle_first)]
+    counted = [
+        *counted[len(ends) :],
+        counted[0],
+        *counted[1 + len(inner) : len(ends)],
+        *(inner[k] for k in middle_first),
+    ]
     fewest = len(counted) if most is not None else len(counted) - max(0, len(inner) - (_FEWEST_PROBES - 2))
-    far_and_near = [strata[-1], strata[0]][:_MOST_WARM_UP]
-    warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in far_and_near]) or counted[:1]
+    far_and_near = [strata[-1], strata[0]] if len(strata) > 1 else strata
+    warm_up = _pick_rarest(drawn, [stratum[~np.isin(stratum, counted)] for stratum in far_and_near])
     first, then = (tuple(drawn.indices[place] for place in places) for places in (warm_up, counted))
     return ProbeFrames(warm_up=first, counted=then, fewest=fewest)
 
@@ -142,28 +145,34 @@ def probe(recipe: Recipe, frames: ProbeFrames, device: Device = "cpu") -> ProbeR
 
 
 def _probe(recipe: Recipe, frames: ProbeFrames, device: Device) -> ProbeResult:
-    drops = list[Drop]()
+    drops, failed_s = list[Drop](), 0.0
     is_compiled = has_compiled(recipe.render.engine, device)
     with scratch_folder() as folder:
         task = FrameTask(recipe, folder, device=device)
-        warm_up, failed_s = make_in_turn(task, frames.warm_up[:1], drops, False)
-        if not is_compiled or all(cpu_s(report) < _LONG_WARM_UP_S for report in warm_up.values()):
-            more, more_failed_s = make_in_turn(task, frames.warm_up[1:], drops, bool(warm_up))
-            warm_up, failed_s = warm_up | more, failed_s + more_failed_s
-        counted, more_failed_s = make_in_turn(task, frames.counted[: frames.fewest], drops, bool(warm_up))
-        for frame_index in frames.counted[frames.fewest :]:
-            if len(counted) < frames.fewest or sum(map(cpu_s, counted.values())) < _ENOUGH_S:
-                more, again_failed_s = make_in_turn(task, (frame_index,), drops, bool(warm_up))
-                counted, more_failed_s = counted | more, more_failed_s + again_failed_s
-        if not counted:
+
+        def make(indices: tuple[int, ...]) -> dict[int, FrameReport]:
+            nonlocal failed_s
+            made, seconds = make_in_turn(task, indices, drops, bool(warm_up))
+            failed_s += seconds
+            return made
+
+        warm_up = dict[int, FrameReport]()
+        possible = list(frames.counted)
+        while possible and not (warm_up := make((possible[0],))):
+            possible.pop(0)
+        if not possible:
             raise ValueError(f"frames: none of {len(frames.counted)} can be made, the last because: {drops[-1].reason}")
-    began_s = time.process_time()
-    quickest = min(counted, key=lambda index: cpu_s(counted[index]))
-    again = render_frame(recipe, quickest, process_engine(recipe.render.engine, device))
-    again_s = time.process_time() - began_s
+        # Its scene exists now, and so the second time tells what a later frame of a scene takes.
+        counted = make((possible[0],))
+        later_scene_s = sum(_in_scene_stages_s(report.stage_s) for report in counted.values())
+        if not is_compiled or all(cpu_s(report) < _LONG_WARM_UP_S for report in warm_up.values()):
+            warm_up |= make(frames.warm_up)
+        for frame_index in possible[1:]:
+            if len(counted) < frames.fewest or sum(map(cpu_s, counted.values())) < _ENOUGH_S:
+                counted |= make((frame_index,))
     in_frames_s = sum(cpu_s(report) for report in [*warm_up.values(), *counted.values()])
-    start_s = time.process_time() - in_frames_s - failed_s - more_failed_s - again_s
-    return ProbeResult(warm_up, counted, _in_scene_stages_s(again.stage_s), max(0.0, start_s), tuple(drops))
+    start_s = time.process_time() - in_frames_s - failed_s
+    return ProbeResult(warm_up, counted, later_scene_s, max(0.0, start_s), tuple(drops))
 
 
 def make_in_turn(
@@ -321,7 +330,7 @@ class _DistanceFit:
 def _scene_s(recipe: Recipe, probed: ProbeResult) -> float:
     """Extra time of the first frame of a scene or of a sequence over its later ones. [s]"""
     first_s: dict[int, float] = {}
-    for frame_index, report in (probed.warm_up | probed.counted).items():
+    for frame_index, report in [*probed.warm_up.items(), *probed.counted.items()]:
         length = None if recipe.sequence is None else recipe.sequence.frames_per_sequence
         unit = scene_of_frame(recipe, frame_index) if length is None else frame_index // length
         first_s.setdefault(unit, _in_scene_stages_s(report.stage_s))
