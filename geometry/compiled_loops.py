@@ -25,6 +25,11 @@ def compiled(loop: _Loop) -> _Loop:
     return kept_on_disk(loop, {"error_model": "numpy", "nogil": True})
 
 
+def inlined(loop: _Loop) -> _Loop:
+    """Compile a function as `compiled` does, into the machine code of each that calls it."""
+    return kept_on_disk(loop, {"error_model": "numpy", "nogil": True, "forceinline": True})
+
+
 def kept_on_disk(loop: _Loop, options: Mapping[str, Any]) -> _Loop:
     """Compile a function at its first call, and keep the result on disk for later processes.
 

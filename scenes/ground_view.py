@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
-from geometry.compiled_loops import compiled
+from geometry.compiled_loops import compiled, inlined
 
 Field = NDArray[np.float32]
 _SMALLEST_LEVEL_PX = 8
@@ -137,28 +137,30 @@ class MipTile:
         )
         total = np.zeros((int(np.prod(shape)), self._channels), dtype=np.float32)
         sizes, lines = (self._side, self._top, self._byte_levels), (x_m, y_m, along_x_m, along_y_m, width_m)
-        _add_samples(self._roots, self._values, sizes, self._texel_m, lines, places, total)
+        channels = tuple(range(self._channels))
+        _add_samples(self._roots, self._values, sizes, self._texel_m, lines, places, channels, total)
         return total.reshape(*shape, self._channels)
 
 
-@compiled
+@inlined
 def _add_level(
     texels: NDArray[np.uint8] | NDArray[np.float32],
     start: int,
     side: int,
     place: tuple[float, float],
     weight: float,
+    channels: tuple[int, ...],
     sums: NDArray[np.float32],
     index: int,
 ) -> None:
     """Add to `sums[index]` what a level has at a place in its texels; bytes are roots of 255 times 255 the value."""
     across, down = np.floor(place[0]), np.floor(place[1])
     a, b = np.float32(place[0] - across), np.float32(place[1] - down)
-    left, top, channels = int(across) & (side - 1), int(down) & (side - 1), sums.shape[1]
+    left, top, count = int(across) & (side - 1), int(down) & (side - 1), len(channels)
     right, below = (left + 1) & (side - 1), (top + 1) & (side - 1)
-    top, below = start + top * side * channels, start + below * side * channels
-    left, right = left * channels, right * channels
-    for c in range(channels):
+    top, below = start + top * side * count, start + below * side * count
+    left, right = left * count, right * count
+    for c in range(count):
         upper = texels[top + left + c] * (np.float32(1.0) - a) + texels[top + right + c] * a
         lower = texels[below + left + c] * (np.float32(1.0) - a) + texels[below + right + c] * a
         value = upper + b * (lower - upper)
@@ -176,6 +178,7 @@ def _add_samples(
     texel_m: float,
     lines: tuple[Field, Field, Field, Field, Field],
     places: int,
+    channels: tuple[int, ...],
     sums: Field,
 ) -> None:
     """Add the means at places on lines; see `MipTile.sample_along`.
@@ -187,35 +190,38 @@ def _add_samples(
         lines: x and y of their middles, x and y from end to end, and width to average over: (N,), or (1,) where all are
             the same. [m]
         places: on each line.
+        channels: 0 to C - 1. A tuple's length is known to the compiler, which then needs no loop over channels.
         sums: (N, C).
     """
     side, top, byte_levels = sizes
     x_m, y_m, along_x_m, along_y_m, width_m = lines
-    channels = sums.shape[1]
+    count = len(channels)
     # Where each level begins among those of its kind, and its share of the finest one's side.
     starts, scales = np.zeros(top + 2, np.int64), np.ones(top + 2, np.float64)
     for number in range(1, top + 2):
         scales[number] = 0.5 * scales[number - 1]
         if number != byte_levels:
-            starts[number] = starts[number - 1] + (side >> (number - 1)) * (side >> (number - 1)) * channels
-    level = 0.0
+            starts[number] = starts[number - 1] + (side >> (number - 1)) * (side >> (number - 1)) * count
+    steps = (np.arange(places) + 0.5) / places - 0.5
+    finer, weights = 0, np.zeros(2, np.float64)
     for index in range(sums.shape[0]):
         if index == 0 or width_m.size > 1:
             level = min(max(np.log2(max(float(width_m[index]), 1e-3) / texel_m), 0.0), float(top))
+            finer = int(level)
+            weights[0], weights[1] = (1.0 - (level - finer)) / places, (level - finer) / places
         x, y = float(x_m[index if x_m.size > 1 else 0]), float(y_m[index if y_m.size > 1 else 0])
         along = index if along_x_m.size > 1 else 0
-        for place in range(places):
-            step = (place + 0.5) / places - 0.5
+        for step in steps:
             u, v = (x + step * along_x_m[along]) / texel_m, (y + step * along_y_m[along]) / texel_m
-            for number in range(int(level), int(level) + 2):
-                weight = (1.0 - abs(level - number)) / places
+            for coarser in range(2):
+                number, weight = finer + coarser, weights[coarser]
                 if weight <= 0.0:
                     continue
                 at = u * scales[number] - 0.5, v * scales[number] - 0.5
                 if number < byte_levels:
-                    _add_level(roots, starts[number], side >> number, at, weight, sums, index)
+                    _add_level(roots, starts[number], side >> number, at, weight, channels, sums, index)
                 else:
-                    _add_level(values, starts[number], side >> number, at, weight, sums, index)
+                    _add_level(values, starts[number], side >> number, at, weight, channels, sums, index)
 
 
 @dataclass(frozen=True, eq=False)

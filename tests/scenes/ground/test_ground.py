@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from datasets_manifest.types.environment import GROUND_KINDS, Environment
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
@@ -86,6 +87,43 @@ def test_a_tile_is_averaged_over_the_footprint() -> None:
     deviations = [float(tile.sample(x, y, np.full_like(x, width)).std()) for width in (4.0, 16.0)]
     # Bilinear interpolation keeps 2/3 of the deviation on average over places; 16 texels leave 1e3 independent ones.
     np.testing.assert_allclose(deviations, [2 / 3 / 4, 2 / 3 / 16], rtol=0.1)
+
+
+@pytest.mark.parametrize("is_coded", [False, True])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_means_along_lines_are_those_of_interpolated_levels(channels: int, is_coded: bool) -> None:
+    """Linear between texels by SciPy, between levels by the logarithm of the width, and a mean over the places."""
+    rng = np.random.default_rng(channels)
+    texels, texel_m, places = rng.random((64, 64, channels), dtype=np.float32), 0.5, 3
+    x_m, y_m, along_x_m, along_y_m = rng.uniform(-100, 100, (4, 40, 5)).astype(np.float32)
+    # From finer than the texels to coarser than the coarsest level, of 8 texels a side.
+    width_m = np.geomspace(0.1, 30, 200, dtype=np.float32).reshape(40, 5)
+    found = MipTile(texels, texel_m, is_coded).sample_along((x_m, y_m), (along_x_m, along_y_m), width_m, places)
+
+    x_m, y_m, along_x_m, along_y_m = (part.astype(np.float64) for part in (x_m, y_m, along_x_m, along_y_m))
+    levels = [texels]
+    while len(levels[-1]) > 8:
+        side = len(levels[-1]) // 2
+        levels.append(levels[-1].reshape(side, 2, side, 2, channels).mean(axis=(1, 3)))
+    shares = np.clip(np.log2(width_m.astype(np.float64) / texel_m), 0, len(levels) - 1)
+    expected = np.zeros((40, 5, channels))
+    for step in (np.arange(places) + 0.5) / places - 0.5:
+        for number, level in enumerate(levels):
+            texel = [
+                (along + step * way) / (texel_m * 2**number) - 0.5
+                for along, way in ((y_m, along_y_m), (x_m, along_x_m))
+            ]
+            # The two finest levels are kept, and interpolated, as square roots.
+            power = 2 if is_coded and number < 2 else 1
+            values = [
+                map_coordinates(level[..., c] ** (1 / power), texel, order=1, mode="grid-wrap") ** power
+                for c in range(channels)
+            ]
+            weight = np.maximum(1 - np.abs(shares - number), 0) / places
+            expected += weight[..., None] * np.stack(values, axis=-1)
+    # A root in eight bits is off by up to half of 1/255, and its square by twice that, 0.004. The others carry some
+    # roundings of float32.
+    np.testing.assert_allclose(found, expected, atol=0.004 if is_coded else 1e-6)
 
 
 def test_a_tile_repeats_without_a_seam() -> None:
