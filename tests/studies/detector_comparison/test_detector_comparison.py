@@ -41,6 +41,7 @@ from studies.detector_comparison.ablation import (
     measured_networks,
     settings_text,
 )
+from studies.detector_comparison.accuracy_plot import pareto_front
 from studies.detector_comparison.options import input_size_px
 from studies.detector_comparison.ultralytics_peers import (
     check_corpus,
@@ -257,6 +258,23 @@ def test_trained_peers_are_timed_and_scored_by_the_benchmark(screen_dataset: Pat
             key: overall[key] for key in ("ap", "ap50", "ap75", "recall")
         }
     assert table["detectors"]["yolov8n"]["ap50"] == 0.0 < table["detectors"]["yolov8s"]["ap50"] < 1.0
+    picture = cv2.imread(str(out / "accuracy.png"))
+    # Squares of the two peers in both halves.
+    blue = cv2.connectedComponents(cv2.inRange(picture, np.array([110, 70, 40]), np.array([150, 110, 80])))[0] - 1
+    assert blue == 4
+
+
+@pytest.mark.parametrize(
+    ("points", "front"),
+    [
+        ([(3.0, 0.9), (1.0, 0.5), (2.0, 0.4), (2.5, 0.9)], [1, 3]),
+        ([(1.0, 0.5), (1.0, 0.5), (1.0, 0.7)], [2]),
+        ([(2.0, 0.5), (2.0, 0.5)], [0]),
+        ([], []),
+    ],
+)
+def test_the_front_holds_what_no_other_beats_in_both(points: list[tuple[float, float]], front: list[int]) -> None:
+    assert pareto_front(points) == front
 
 
 def test_the_pairs_of_the_test_dataset_are_scored(screen_dataset: Path, smoke_dataset: Path, tmp_path: Path) -> None:
