@@ -21,6 +21,7 @@ IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tif
 _UPRIGHT: Final = 1
 # OpenCV applies the EXIF orientation of these; TIFF has the same number as a tag of its own.
 _TURNED_BY_OPENCV: Final = ("JPEG", "MPO", "PNG", "TIFF")
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
 # Only files that begin or hold these can have an orientation or pages; Pillow decodes a whole PNG to look for it.
 _TIFF_AND_WEBP: Final = (b"II", b"MM", b"RIFF")
 _ORIENTATION_MARKS: Final = (b"Exif", b"eXIf", b"exif", b"adobe.xmp", b"rientation")
@@ -60,13 +61,34 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
     orientation = _orientation(data, name)
     try:
         with limited_memory(data.size):
-            image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+            shown = _without_color_profile(data)
+            image = cv2.imdecode(shown, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
     except (cv2.error, ValueError) as error:
         raise ValueError(f"{name}: cannot be read: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{name}: is truncated, or not an image of 8 or 16 bits")
     pixels = np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     return pixels, orientation != _UPRIGHT
+
+
+def _without_color_profile(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A PNG without its ICC profile, any other file as it is.
+
+    OpenCV does not apply the profile, and its PNG library writes warnings of common faults in it to the terminal.
+
+    Source: ISO/IEC 15948, Portable Network Graphics, 5.3 (chunks) and 5.6 (their order).
+    """
+    file = data.tobytes()
+    place = len(_PNG)
+    if not file.startswith(_PNG):
+        return data
+    # A profile comes before the pixels, so that most files are searched no farther than their first chunks.
+    while place + 8 <= len(file) and (kind := file[place + 4 : place + 8]) != b"IDAT":
+        end = place + 12 + int.from_bytes(file[place : place + 4], "big")
+        if kind == b"iCCP" and end <= len(file):
+            return np.frombuffer(file[:place] + file[end:], dtype=np.uint8)
+        place = end
+    return data
 
 
 def _check_size(data: NDArray[np.uint8], name: str) -> None:

@@ -92,6 +92,22 @@ def test_an_orientation_beyond_the_definition_is_upright() -> None:
     np.testing.assert_array_equal(decode_image_file(encoded(STORED, "PNG", 9), "a.png")[0], STORED)
 
 
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+def test_a_faulty_color_profile_is_no_matter_for_the_terminal(mode: str, capfd: pytest.CaptureFixture[str]) -> None:
+    pixels = np.random.default_rng(3).integers(256, size=(12, 16) if mode == "L" else (12, 16, 3), dtype=np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(pixels, mode).save(file, "PNG", icc_profile=b"no profile" * 20)
+    data = np.frombuffer(file.getvalue(), np.uint8)
+    cv2.imdecode(data, cv2.IMREAD_ANYCOLOR)
+    assert "iCCP" in capfd.readouterr().err
+    found, _ = decode_image_file(data, "picture")
+    np.testing.assert_array_equal(found, pixels)
+    assert capfd.readouterr() == ("", "")
+    # A profile that is cut off leaves nothing to read.
+    with pytest.raises(ValueError, match="picture: is truncated"):
+        decode_image_file(data[:60], "picture")
+
+
 def test_webp_is_read() -> None:
     np.testing.assert_array_equal(decode_image_file(encoded(STORED, "WEBP"), "a.webp")[0], STORED)
 
