@@ -20,8 +20,8 @@ pytestmark = pytest.mark.mitsuba
 
 @pytest.fixture(scope="module")
 def settled(engine: RenderEngine) -> tuple[Recipe, FrameSpec, StereoRadiance]:
-    """A frame at a third of the paper's scale, its recipe, and what many paths through every pixel make of it."""
-    recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
+    """A frame at a quarter of the paper's scale, its recipe, and what many paths through every pixel make of it."""
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     many = {"samples_per_px": 100, "open_samples_per_px": 36, "edge_samples_per_px": 400, "denoise": False}
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
@@ -118,7 +118,7 @@ def below_the_wing(engine: RenderEngine) -> tuple[Recipe, FrameSpec, StereoRadia
     """A frame that shows pod and wing, its recipe, and what many paths through every pixel make of it."""
     recipe = paper_view_recipe(scale=1 / 3, stations_m=(12.0,))
     frame = next(frame for index in range(50) if shows_the_tanker(frame := sample_frame(recipe, index)))
-    many = {"surround_samples_per_px": 256, "denoise": False}
+    many = {"surround_samples_per_px": 64, "edge_samples_per_px": 16, "denoise": False}
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
 
 
@@ -143,7 +143,7 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(
     assert len(settled) > 2000
     errors = []
     for denoise in (True, False):
-        seen = engine.render(frame, recipe.render.model_copy(update={"denoise": denoise}))
+        seen = engine.render(frame, recipe.render.model_copy(update={"denoise": denoise, "edge_samples_per_px": 16}))
         errors.append(on_the_tanker(seen.left) - settled)
     smoothed, alone = (np.sqrt(np.mean(error**2)) for error in errors)
     # Some thirty-five neighbours' paths, nine for each, against a pixel's own four would leave a tenth; the rest is

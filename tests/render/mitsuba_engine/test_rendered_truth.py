@@ -21,7 +21,7 @@ pytestmark = pytest.mark.mitsuba
 
 # (1 - Rec. 709 luminance of the lamp's light is 1 by construction): far above any sky.
 LAMP_CD_M2 = 1e6
-# Rays through other things, whose light both pictures of a difference share.
+# Rays through other things, whose light is taken off again.
 FEWEST_ELSEWHERE = {"open_samples_per_px": 1, "surround_samples_per_px": 1}
 # For passes, which are those of pixel centres however few rays make the light.
 FEWEST = {**FEWEST_ELSEWHERE, "samples_per_px": 1, "edge_samples_per_px": 1, "denoise": False}
@@ -38,8 +38,13 @@ def without_clouds(frame: FrameSpec) -> FrameSpec:
 
 
 def emission_images(engine: RenderEngine, frame: FrameSpec, settings: RenderSettings) -> dict[str, np.ndarray]:
-    """Light of the lamps alone: the same frame with lamps minus without."""
-    on, off = engine.render(lit(frame, LAMP_CD_M2), settings), engine.render(frame, settings)
+    """Light of the lamps alone: the same frame with lamps minus without.
+
+    Sun and sky bring below 1 % of the lamps' light: four rays through an edge know their step to half of that, and add
+    0.25 % to the 1.3 % by which 64 jittered rays miss the lamp's share of a pixel.
+    """
+    on = engine.render(lit(frame, LAMP_CD_M2), settings)
+    off = engine.render(frame, settings.model_copy(update={**FEWEST, "edge_samples_per_px": 4}))
     return {
         eye: (getattr(on, eye).radiance_cd_m2 - getattr(off, eye).radiance_cd_m2) @ REC709_LUMINANCE for eye in EYES
     }
@@ -57,9 +62,9 @@ def centroid_and_area(image: np.ndarray, center_px: np.ndarray, radius_px: float
 
 def test_centroids_of_lit_markers_are_the_ellipse_centres(engine: RenderEngine) -> None:
     errors, area_ratios = [], []
-    # Near drogues in half as many pixels a side: their markers have 5 px and more all the same. Far ones in the middle
-    # of the paper's view.
-    views = ((0.5, 2.0, 1.0), (0.5, 5.0, 0.5), (1.0, 10.0, 0.25), (1.0, 20.0, 0.25), (1.0, 40.0, 0.125))
+    # Near drogues in a quarter or half as many pixels a side: their markers have 5 px and more all the same. Far ones
+    # in the middle of the paper's view.
+    views = ((0.25, 2.0, 1.0), (0.25, 5.0, 0.5), (0.5, 10.0, 0.25), (1.0, 20.0, 0.25), (1.0, 40.0, 0.125))
     for scale, distance_m, window in views:
         recipe = paper_view_recipe(scale, (distance_m,), samples=1, window=window)
         settings = recipe.render.model_copy(update={"edge_samples_per_px": 64, **FEWEST_ELSEWHERE})
@@ -77,7 +82,8 @@ def test_centroids_of_lit_markers_are_the_ellipse_centres(engine: RenderEngine) 
     errors = np.array(errors)
     assert len(errors) == 5 * 8 * 2
     print("rms px", np.sqrt(np.mean(errors**2)), "mean px", errors.mean(axis=0), "area", np.mean(area_ratios))
-    # The bar that the labels are held to; 64 jittered samples in each pixel of an edge leave about 0.004 px of noise.
+    # The bar that the labels are held to; 64 jittered samples in each pixel of an edge leave about 0.0045 px of noise,
+    # which falls with the square root of the radius.
     assert np.sqrt(np.mean(errors**2)) <= 0.01
     assert np.abs(errors.mean(axis=0)).max() <= 0.003
     # Area: haze over 40 m takes below 0.1 %; sampling noise of one area is below 1 %, of the mean below 0.1 %.
@@ -131,9 +137,10 @@ def test_passes_of_pixel_centres(engine: RenderEngine) -> None:
 
 def test_same_frame_same_bits(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.125, stations_m=(3.0, 5.0), samples=4)
-    first = engine.render(sample_frame(recipe, 0), recipe.render)
-    engine.render(sample_frame(recipe, 1), recipe.render)
-    again = engine.render(sample_frame(recipe, 0), recipe.render)
+    settings = recipe.render.model_copy(update={"edge_samples_per_px": 16})
+    first = engine.render(sample_frame(recipe, 0), settings)
+    engine.render(sample_frame(recipe, 1), settings)
+    again = engine.render(sample_frame(recipe, 0), settings)
     for eye in EYES:
         for name in ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal"):
             assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
@@ -141,25 +148,26 @@ def test_same_frame_same_bits(engine: RenderEngine) -> None:
 
 def test_moving_drogue_is_blurred_around_its_middle(engine: RenderEngine) -> None:
     """The centroid of a streak is the mid-exposure place, and the streak is as long as speed times time says."""
-    recipe = paper_view_recipe(scale=0.5, stations_m=(5.0,), samples=1, window=0.5)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(5.0,), samples=1, window=0.5)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 64, **FEWEST_ELSEWHERE})
     still = sample_frame(recipe, 0).model_copy(
         update={"exposure": sample_frame(recipe, 0).exposure.model_copy(update={"time_s": 0.01})}
     )
-    across = still.left_from_drogue.rotation.T @ np.array([3.0, 0.0, 0.0])
+    across = still.left_from_drogue.rotation.T @ np.array([6.0, 0.0, 0.0])
     moving = still.model_copy(update={"drogue_twist_per_s": np.concatenate([across, np.zeros(3)])})
     layout = marker_layout(still.drogue)
     truth = project_disc_centers(
         recipe.rig, still.left_from_drogue, layout.centers_m, np.full(8, layout.radius_m), "left"
     )
     sharp, blurred = (emission_images(engine, frame, settings)["left"] for frame in (still, moving))
-    travel_px = recipe.rig.camera.fx_px * 3.0 * 0.01 / 5.0
+    travel_px = recipe.rig.camera.fx_px * 6.0 * 0.01 / 5.0
     for center in truth:
         radius_px = 1.1 * layout.radius_m * recipe.rig.camera.fx_px / 5.0 + travel_px / 2
         place, area = centroid_and_area(blurred, center, radius_px)
         still_place, still_area = centroid_and_area(sharp, center, radius_px)
-        # 64 random times of a streak of 6 px scatter each edge pixel; 0.1 px is 4 standard errors of the centroid.
-        assert np.abs(place - still_place).max() < 0.1
+        # 64 random times of a streak of 6 px scatter each pixel that an end sweeps. Around a disc of radius r those are
+        # 4 r 6 px2, by 1/6 of a pixel's light for one time: 0.08 px / sqrt(r / px), here 0.035 px. Four of them:
+        assert np.abs(place - still_place).max() < 0.14
         assert area == pytest.approx(still_area, rel=0.03)
     row = round(truth[0, 1])
     width = [np.count_nonzero(image[row] > 0.02 * LAMP_CD_M2) for image in (sharp, blurred)]
@@ -182,7 +190,7 @@ def test_rays_through_seams_are_sent_again(engine: RenderEngine) -> None:
     np.testing.assert_allclose(seen.depth_m[v, u], (origin @ normal) / (rays @ normal), atol=1e-5)
 
 
-@pytest.mark.parametrize("index", [341, 594])
+@pytest.mark.parametrize("index", [341, pytest.param(594, marks=pytest.mark.slow)])
 def test_rays_that_slip_into_a_markers_pocket_are_sent_again(engine: RenderEngine, index: int) -> None:
     """In these frames a ray just beyond a marker slips through the face's front and ends on the marker's wall."""
     # Frames found by search, in streams of the seed alone.
