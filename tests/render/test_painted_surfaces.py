@@ -17,8 +17,9 @@ from drogue_models.painted_mesh import PaintedMesh, Sheen
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.surface_looks import SurfaceWear
 from geometry.se3 import RigidTransform
+from geometry.stereo import EYES
 from render.compositing import inside_one_part
-from render.engine import RenderEngine, load_engine
+from render.engine import RenderEngine, StereoRadiance, load_engine
 from render.surfaces import frame_surfaces
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
@@ -128,7 +129,8 @@ def test_a_lamp_smaller_than_a_pixel_keeps_its_light(
 
 
 def test_worn_drogues_share_a_scene_and_take_their_own_maps(engine: RenderEngine, frame: FrameSpec) -> None:
-    few = SETTINGS.model_copy(update={"edge_samples_per_px": 1})
+    # All pictures share their random numbers, so that noise is no difference.
+    few = SETTINGS.model_copy(update={"edge_samples_per_px": 1, "noise_over_sensor": 100.0})
 
     def worn(seed: int) -> FrameSpec:
         return frame.model_copy(update={"condition": DrogueCondition(wear=SurfaceWear(seed=seed, fading=0.9))})
@@ -176,21 +178,32 @@ def test_maps_leave_smoothed_light_unbiased(engine: RenderEngine) -> None:
     worst = SurfaceWear(seed=2, soot=0.8, oil=0.8, edge_wear=0.8, fading=0.8, tape=0.5)
     worn = sample_frame(recipe, 0).model_copy(update={"condition": DrogueCondition(wear=worst)})
     # Edges are left out below.
-    many = {"samples_per_px": 196, "open_samples_per_px": 64, "edge_samples_per_px": 1, "denoise": False}
-    truth = engine.render(worn.model_copy(update={"seed": 99}), recipe.render.model_copy(update=many)).left
+    many = {"samples_per_px": 100, "open_samples_per_px": 36, "edge_samples_per_px": 1, "denoise": False}
+    truth = engine.render(worn.model_copy(update={"seed": 99}), recipe.render.model_copy(update=many))
     few = recipe.render.model_copy(update={"edge_samples_per_px": 16})
-    renders = [engine.render(worn.model_copy(update={"seed": seed}), few).left for seed in range(3)]
-    smoothed = np.mean([seen.radiance_cd_m2 for seen in renders], axis=0)
+    renders = [engine.render(worn.model_copy(update={"seed": seed}), few) for seed in range(2)]
+
+    def light_inside(seen: StereoRadiance, part: Part) -> np.ndarray:
+        """Of both eyes, summed over the colours."""
+        views = [getattr(seen, eye) for eye in EYES]
+        inside = [(view.part_id == part) & inside_one_part(view.part_id) for view in views]
+        lights = [view.radiance_cd_m2[where].sum(axis=-1) for view, where in zip(views, inside, strict=True)]
+        return np.concatenate(lights).astype(float)
+
     for part in (Part.FACE, Part.HUB, Part.COUPLING):
-        inside = (truth.part_id == part) & inside_one_part(truth.part_id)
-        ours, theirs = (light[inside].sum(axis=-1).astype(float) for light in (smoothed, truth.radiance_cd_m2))
-        # Noise of the means is 0.1 to 0.2 %.
-        assert ours.mean() / theirs.mean() == pytest.approx(1.0, abs=0.006)
-        # Where the map is dark, light that was divided by little is multiplied by as little again.
-        dark = theirs <= np.quantile(theirs, 0.1)
-        assert ours[dark].mean() / theirs[dark].mean() == pytest.approx(1.0, abs=0.05)
-    face = (truth.part_id == Part.FACE) & inside_one_part(truth.part_id)
-    assert np.corrcoef(smoothed[face].sum(axis=-1), truth.radiance_cd_m2[face].sum(axis=-1))[0, 1] > 0.99
+        (first, second), theirs = (light_inside(seen, part) for seen in renders), light_inside(truth, part)
+        ours = (first + second) / 2
+        # In one picture and eye the face's mean has 0.03 % of noise, that of hub and coupling, some 250 pixels each, up
+        # to 0.8 %, of two pictures and both eyes 0.4 %. With 0.3 % of many paths' own that is 0.5 %.
+        assert ours.mean() / theirs.mean() == pytest.approx(1.0, abs=0.002 if part == Part.FACE else 0.015)
+        # Where the map is dark, light that was divided by little is multiplied by as little again. Another picture than
+        # those compared says where: noise would choose what it darkens. On the few such pixels of the coupling there is
+        # too much of it.
+        if part != Part.COUPLING:
+            dark = first <= np.quantile(first, 0.1)
+            assert second[dark].mean() / theirs[dark].mean() == pytest.approx(1.0, abs=0.04)
+        if part == Part.FACE:
+            assert np.corrcoef(ours, theirs)[0, 1] > 0.99
 
 
 def test_a_sheen_beside_the_drogue_is_as_bright_as_paths_alone_find_it(
@@ -198,7 +211,7 @@ def test_a_sheen_beside_the_drogue_is_as_bright_as_paths_alone_find_it(
 ) -> None:
     shiny = replace(plate(quarters()), sheen=Sheen(0.3, 0.3))
     painted = frame_with(monkeypatch, frame, [(shiny, PLACE)])
-    many = {"denoise": False, "surround_samples_per_px": 400}
+    many = {"denoise": False, "surround_samples_per_px": 100}
     alone = quarter_means(painted, engine.render(painted, SETTINGS.model_copy(update=many)).left)
     np.testing.assert_allclose(quarter_means(painted, engine.render(painted, SETTINGS).left), alone, rtol=0.02)
     matt = frame_with(monkeypatch, frame, [(plate(quarters()), PLACE)])

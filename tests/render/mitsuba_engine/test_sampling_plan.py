@@ -28,7 +28,7 @@ def test_dirt_on_a_marker_is_an_edge_everywhere(engine: RenderEngine) -> None:
 
 
 def test_a_dirty_marker_has_little_noise(engine: RenderEngine) -> None:
-    recipe = paper_view_recipe(scale=0.5, stations_m=(6.0,))
+    recipe = paper_view_recipe(scale=0.5, stations_m=(6.0,), window=0.5)
     frame = sample_frame(recipe, 0)
     dirty = [SurfaceCondition(dirt_fraction=0.4, dirt_seed=index) for index in range(frame.drogue.marker_count)]
     frame = frame.model_copy(update={"condition": DrogueCondition(markers=tuple(dirty))})
