@@ -100,5 +100,5 @@ def test_both_path_tracers_agree(made: Any, engine: RenderEngine) -> None:
         assert np.median(np.abs(a.depth_m[same] / b.depth_m[same] - 1)) < 1e-6
         np.testing.assert_allclose(a.normal[same], b.normal[same], atol=1e-3)
         assert a.coverage.sum() == pytest.approx(b.coverage.sum(), rel=2e-3)
-        # Noise of 16 paths over ten thousand pixels, most of it on edges.
+        # Noise of 16 paths and more over ten thousand pixels, most of it on edges.
         assert a.radiance_cd_m2.mean() == pytest.approx(b.radiance_cd_m2.mean(), rel=2e-3)

@@ -39,7 +39,7 @@ def test_white_face_shines_as_its_irradiance_says(engine: RenderEngine, sun_azim
     expected = luminance(environment_radiance(environment).plate_illuminance_lux(normal)) / np.pi
     inside = (seen.part_id == Part.FACE) & (seen.coverage > 0.999)
     got = luminance(seen.radiance_cd_m2[inside]).mean()
-    # Monte Carlo over some 1000 pixels of 256 paths: below 0.3 %; the sky map's texels of 1.4 degrees: below 1 %.
+    # Monte Carlo over some 1000 pixels of 16 paths: below 0.3 %; the sky map's texels of 1.4 degrees: below 1 %.
     # The rim torus and the hose reflect a little light on the face.
     assert got == pytest.approx(float(expected), rel=0.015)
 
@@ -58,5 +58,5 @@ def test_nothing_shadows_the_markers(engine: RenderEngine) -> None:
         inside = cv2.erode((seen.part_id == 32 + marker).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         values = seen.radiance_cd_m2[inside, 0]
         top, bottom = np.percentile(values, [99, 1])
-        # Sun on a flat disc: only sampling noise of the sky's part (256 paths) may spread the pixels.
+        # Sun on a flat disc: only sampling noise of the sky's part (16 paths) may spread the pixels.
         assert (top - bottom) / values.mean() < 0.12
