@@ -163,9 +163,11 @@ def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
                 image, placement = input_image(images, eye, size_px)
                 name = f"{splits[index]}/{index:06d}_{eye}"
                 (folder / "images" / f"{name}.png").write_bytes(encode_png(image))
-                box = (record.views.left if eye == "left" else record.views.right).box_visible_xywh_px
-                row = "" if box is None else _row(box, placement, size_px)
-                (folder / "labels" / f"{name}.txt").write_text(row, encoding="utf-8")
+                view = record.views.left if eye == "left" else record.views.right
+                # Drogues of other tankers are boxes for us too, in training and in the scores.
+                boxes = [view.box_visible_xywh_px, *(other.box_visible_xywh_px for other in view.neighbours)]
+                rows = "".join(_row(box, placement, size_px) for box in boxes if box is not None)
+                (folder / "labels" / f"{name}.txt").write_text(rows, encoding="utf-8")
         lines = "".join(f"{split}: images/{split}\n" for split in SPLITS)
         (folder / "data.yaml").write_text(f'path: ""\n{lines}names:\n  0: drogue\n', encoding="utf-8")
     return data
