@@ -22,6 +22,7 @@ from labelgen.export.annotations.yolo import write_yolo_detect
 from labelgen.export.export_log import ExportLog
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
 from labelgen.validation.dataset_checks import validate_dataset
+from studies.detector_comparison.ultralytics_peers import export_corpus
 from tests.support.batch_datasets import render_recipe
 from tests.support.recipe_builder import RIG_320_PX, recipe_text, stations
 
@@ -130,6 +131,25 @@ def test_yolo_has_a_row_for_each(dataset: Path, tmp_path: Path) -> None:
             part_id = source.part_ids(index, eye)
             shown = sum(bool(np.isin(part_id, drogue_part_ids(8, k)).any()) for k in (0, 1))
             assert sum(row[0] == "0" for row in rows) == shown
+
+
+def test_networks_of_others_learn_all_of_them(dataset: Path, tmp_path: Path) -> None:
+    write_yolo_detect(dataset, tmp_path / "yolo", ExportLog())
+    export_corpus(dataset, tmp_path / "peers", (320, 256))
+    several = 0
+    for file in (tmp_path / "peers" / "labels").glob("*/*.txt"):
+        (ours,) = (tmp_path / "yolo" / "labels").glob(f"*/{file.name}")
+        rows, expected = (
+            sorted([float(number) for number in line.split()] for line in path.read_text().splitlines())
+            for path in (file, ours)
+        )
+        several += len(rows) > 1
+        # 320 x 240 px in the middle of 320 x 256.
+        moved = [
+            [x, (240 * y + 8) / 256, width, 240 / 256 * height] for kind, x, y, width, height in expected if kind == 0
+        ]
+        np.testing.assert_allclose([row[1:] for row in rows], moved, atol=1e-5)  # written as text
+    assert several >= 4
 
 
 def test_detectors_have_to_find_all_of_them(dataset: Path) -> None:
