@@ -38,9 +38,9 @@ def made_before(frame_index: int) -> list[int]:
 
 
 def test_an_engine_that_aborts_once_is_forgiven(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:
-    troubled(abort_once=[2, 5])
+    troubled(abort_once=[5])
     stormy = render_recipe(tmp_path / "stormy", workers=2, text=QUICK_RECIPE)
-    assert (stormy.drops, stormy.totals.retries, sorted(stormy.totals.made)) == ((), 2, list(range(8)))
+    assert (stormy.drops, stormy.totals.retries, sorted(stormy.totals.made)) == ((), 1, list(range(8)))
     assert file_hashes(tmp_path / "stormy") == file_hashes(quick_dataset)
 
 
@@ -177,7 +177,8 @@ def await_line(process: subprocess.Popen[str], beginning: str) -> None:
         deadline.cancel()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+# What SIGINT does at first is seen with the second signal too.
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     waiting_run: Callable[[], subprocess.Popen[str]],
     number: signal.Signals,

@@ -196,7 +196,7 @@ def torture(recipe_text: str, kills: int, folder: Path, loops: Path | None = Non
 
 
 def test_kills_at_random_instants_change_nothing(tmp_path: Path) -> None:
-    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 16"), 3, tmp_path)
+    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 12"), 2, tmp_path)
 
 
 @pytest.mark.slow

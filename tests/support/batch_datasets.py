@@ -19,8 +19,8 @@ from droguekit.batch.render_dataset import RunSummary, render_dataset
 from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, between, recipe_text
 from tests.support.shared_folder import shared_folder
 
-# Every process that renders computes the ground's texture first: that of the sea takes the shortest time.
-QUICK_GROUND = {"ground": "sea"}
+# Every process that renders ground computes its texture first, for seconds; a picture of sky and ground costs nothing.
+PLAIN_SKY = {"map": {"file": str(Path(__file__).with_name("plain_sky.hdr")), "cd_m2_per_unit": 1000.0}}
 
 # Four pairs of 320 x 240 pixels.
 TINY_RECIPE = recipe_text(
@@ -29,8 +29,14 @@ TINY_RECIPE = recipe_text(
     rig=RIG_320_PX,
     frames={"count": 4, "scenes": 2},
     distance=between(3.0, 12.0, "log-uniform"),
-    environment=QUICK_GROUND,
-    render={"samples_per_px": 1, "surround_samples_per_px": 1, "max_depth": 2},
+    environment=PLAIN_SKY,
+    render={
+        "samples_per_px": 1,
+        "open_samples_per_px": 1,
+        "edge_samples_per_px": 1,
+        "surround_samples_per_px": 1,
+        "max_depth": 2,
+    },
     split={"train": 0.5, "test": 0.5},
 )
 
@@ -89,7 +95,7 @@ QUICK_RECIPE = recipe_text(
     rig=RIG_160_PX,
     frames={"count": 8, "scenes": 2},
     distance=between(3.0, 12.0, "log-uniform"),
-    environment=QUICK_GROUND,
+    environment=PLAIN_SKY,
     render={"engine": "troubled"},
     split={"train": 0.5, "test": 0.5},
 )
