@@ -143,7 +143,7 @@ def bodies(draw: st.DrawFn) -> DrogueParameters:
     )
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(drogue=bodies())
 def test_any_body_is_closed_behind_the_rim_plane_and_inside_the_rim(drogue: DrogueParameters) -> None:
     meshes = check_solids(drogue)

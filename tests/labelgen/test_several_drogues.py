@@ -41,7 +41,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         hose={},
         receiver={"nose_scene_fraction": 0.5},
         neighbours={"scene_fraction": 1.0, "distance_fraction": [1.2, 1.6]},
-        render={"samples_per_px": 1, "edge_samples_per_px": 4},
+        # Labels ask where surfaces lie and not for their light.
+        render={
+            "samples_per_px": 1,
+            "open_samples_per_px": 1,
+            "edge_samples_per_px": 1,
+            "surround_samples_per_px": 1,
+            "max_depth": 2,
+            "denoise": False,
+        },
     )
     folder: Path = tmp_path_factory.mktemp("several") / "dataset"
     render_recipe(folder, workers=0, text=text)

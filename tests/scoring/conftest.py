@@ -301,7 +301,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[PairRe
     return make_dataset(tmp_path_factory.mktemp("dataset"), records), records
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def build() -> SimpleNamespace:
     return SimpleNamespace(
         drogue=make_drogue,

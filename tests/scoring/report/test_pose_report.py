@@ -25,23 +25,29 @@ DatasetFixture = tuple[Path, list[PairRecord]]
 METHODS = {"joint": 1.0, "paper": 6.0, "circle-fit": 4.0}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scored(
-    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, BenchmarkResult]:
     folder, records = dataset
-    estimates = tmp_path / "estimates.jsonl"
-    write_estimates(estimates, build.estimates(records, METHODS, rng))
+    estimates = tmp_path_factory.mktemp("scored") / "estimates.jsonl"
+    write_estimates(estimates, build.estimates(records, METHODS, np.random.default_rng(7)))
     return folder, estimates, run_benchmark(folder, estimates)
 
 
-def test_the_page_needs_nothing_from_outside(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
-    write_report(*scored, tmp_path / "report.html")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    page = ParsedPage(text)
+@pytest.fixture(scope="module")
+def page_text(scored: tuple[Path, Path, BenchmarkResult], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of `scored`."""
+    page = tmp_path_factory.mktemp("page") / "report.html"
+    write_report(*scored, page)
+    return page.read_text(encoding="utf-8")
+
+
+def test_the_page_needs_nothing_from_outside(page_text: str) -> None:
+    page = ParsedPage(page_text)
     assert page.open_tags == []
     assert all(reference.startswith(("#", "data:image/jpeg;base64,")) for reference in page.references)
-    without_pictures = re.sub(r"data:image/jpeg;base64,[\w+/=]+", "", text)
+    without_pictures = re.sub(r"data:image/jpeg;base64,[\w+/=]+", "", page_text)
     assert not re.search(r"https?:|//[a-z]|@import|url\((?!#)", without_pictures)
     assert "script" not in page.tags
     assert "link" not in page.tags
@@ -50,11 +56,9 @@ def test_the_page_needs_nothing_from_outside(scored: tuple[Path, Path, Benchmark
 
 
 def test_the_page_has_every_figure_picture_and_table(
-    scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path
+    scored: tuple[Path, Path, BenchmarkResult], page_text: str
 ) -> None:
-    folder, estimates, result = scored
-    write_report(folder, estimates, result, tmp_path / "report.html")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text, result = page_text, scored[2]
     for quantity in QUANTITIES:
         assert f'aria-label="{quantity.title} against distance' in text
     assert text.count("data:image/jpeg") == 9
@@ -81,10 +85,11 @@ def test_times_of_a_pair_leave_out_waiting(build: SimpleNamespace, tmp_path: Pat
     assert stages == "read 512, wait 256, handover 128, track 4.00, pose 2.00"
 
 
-def test_the_page_is_the_same_every_time(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
-    for name in ("a.html", "b.html"):
-        write_report(*scored, tmp_path / name)
-    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+def test_the_page_is_the_same_every_time(
+    scored: tuple[Path, Path, BenchmarkResult], page_text: str, tmp_path: Path
+) -> None:
+    write_report(*scored, tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == page_text
 
 
 def test_a_result_of_another_dataset_is_refused(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
@@ -128,7 +133,6 @@ def test_panels_are_well_formed_and_leave_no_trace(scored: tuple[Path, Path, Ben
         assert root.attrib["viewBox"]
         assert "currentColor" in panel
     assert len(ids) == len(set(ids))
-    assert panels == [error_panel(scored[2], quantity) for quantity in QUANTITIES]
 
 
 def test_every_method_looks_different() -> None:
