@@ -95,7 +95,7 @@ class OnFrame:
 def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
     start: Start, scheduler: str, tmp_path: Path
 ) -> None:
-    text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
+    text = ANALYTIC_RECIPE.replace("count = 8", "count = 12")
     render_recipe(tmp_path / "calm", workers=0, text=text)
     workers = [worker(start, scheduler) for _ in range(2)]
 
@@ -106,29 +106,29 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
     report = OnFrame(3, change_the_crew)
     out = tmp_path / "out"
     summary = render_dataset(
-        RecipeSource(parse_recipe(text), text), out, range(24), ExecutionOptions(0, scheduler=scheduler), report
+        RecipeSource(parse_recipe(text), text), out, range(12), ExecutionOptions(0, scheduler=scheduler), report
     )
     assert summary.drops == ()
     assert file_hashes(out) == file_hashes(tmp_path / "calm")
     lines = [json.loads(line) for line in (out / layout.EVENTS_FILE).read_text().splitlines()]
     frames = [line for line in lines if line["event"] == "frame"]
-    assert sorted(line["frame"] for line in frames) == [*range(24)]
+    assert sorted(line["frame"] for line in frames) == [*range(12)]
     assert all(line["workers_gib"] > 0 for line in frames)
 
 
 def test_a_request_to_stop_finishes_the_frames_in_hand(start: Start, scheduler: str, tmp_path: Path) -> None:
-    text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
+    text = ANALYTIC_RECIPE.replace("count = 8", "count = 12")
     worker(start, scheduler)
     report = OnFrame(2, lambda: os.kill(os.getpid(), signal.SIGINT))
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         render_dataset(
-            RecipeSource(parse_recipe(text), text), out, range(24), ExecutionOptions(0, scheduler=scheduler), report
+            RecipeSource(parse_recipe(text), text), out, range(12), ExecutionOptions(0, scheduler=scheduler), report
         )
     made = len(layout.frame_indices(out))
     # Two were finished, and at most two more were with the one worker.
     assert 2 <= made <= 4
-    assert report.told[-1] == f"stopped after {made} of 24 pairs, all of them complete"
+    assert report.told[-1] == f"stopped after {made} of 12 pairs, all of them complete"
 
 
 def render_on(address: str, out: Path, report: OnFrame) -> None:

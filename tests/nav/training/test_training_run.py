@@ -81,9 +81,9 @@ if __name__ == "__main__":
 
 
 def test_a_killed_training_resumes_with_the_same_losses(split_dataset: Path, tmp_path: Path) -> None:
-    settings = build_settings(None, {**SMALL, "image_passes": 24})
+    settings = build_settings(None, {**SMALL, "image_passes": 16})
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    run(split_dataset, whole, image_passes=24)
+    run(split_dataset, whole, image_passes=16)
     # Asked after each of 8 pairs that are decoded, then in every step; two steps are an epoch of 4 pairs.
     script = KILLED.replace("KILLED_AT", "11")
     command = [sys.executable, "-c", script, str(split_dataset), str(killed), settings.model_dump_json()]
@@ -92,7 +92,7 @@ def test_a_killed_training_resumes_with_the_same_losses(split_dataset: Path, tmp
     assert not (killed / "detector.onnx").exists()
     done = len(step_losses(killed))
     assert 0 < done < settings.steps
-    _, told = run(split_dataset, killed, image_passes=24)
+    _, told = run(split_dataset, killed, image_passes=16)
     assert f"resumed after {4 * done}" in told
     # Equal sums in equal order; what is left is how another process's memory happens to be aligned.
     np.testing.assert_allclose(step_losses(killed), step_losses(whole), rtol=1e-4)
@@ -103,7 +103,7 @@ def test_a_killed_training_resumes_with_the_same_losses(split_dataset: Path, tmp
 
 
 def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset: Path, tmp_path: Path) -> None:
-    settings = build_settings(None, {**SMALL, "image_passes": 24})
+    settings = build_settings(None, {**SMALL, "image_passes": 16})
     told = io.StringIO()
     with pytest.raises(KeyboardInterrupt):
         # After the eight pairs that are decoded it is asked once a step.
@@ -204,7 +204,7 @@ def test_errors_of_a_training_are_found_before_there_is_data(split_dataset: Path
 
 def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    run(split_dataset, first, image_passes=16)
+    run(split_dataset, first, image_passes=4)
     start = read_starting_weights(str(first / BEST_FILE))
     # A rate at which nothing is learned leaves the other's weights; those of the seed are far from them.
     settings = build_settings(None, {**SMALL, "image_passes": 4, "learning_rate": 1e-12, "seed": 5})
