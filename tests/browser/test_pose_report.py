@@ -21,7 +21,7 @@ from geometry.se3 import RigidTransform
 
 OpenPage = Callable[..., Any]
 
-PAIRS = 4
+PAIRS = 2
 METHODS = MOST_OPEN_ROWS + 1
 
 

@@ -174,7 +174,7 @@ for depth_m, pose in zip((2.5, 1e-3, 1e9), POSES, strict=True):
 COVARIANCES = [(scale * np.eye(6)).tolist() for scale in (1e-4, 1e-300, 1e300)]
 
 
-@fuzz(190)
+@fuzz(100)
 @given(damage=damages(), name=st.sampled_from([*FORMATS, *VIEWS, "validate", "validate"]))
 def test_damaged_datasets(whole: Path, damage: Damage, name: str) -> None:
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
