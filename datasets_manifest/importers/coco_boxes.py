@@ -156,6 +156,8 @@ class _NameIndex:
         uploaded = _UPLOADED.fullmatch(asked[-1])
         if not fitting and uploaded is not None:
             fitting = self._by_upload.get(uploaded[1], [])
+        # The whole name of an image means that image, though others end in the same.
+        fitting = [entry for entry in fitting if entry[0] == asked] or fitting
         if len(fitting) > 1:
             first, second = ("/".join(parts) for parts, _ in fitting[:2])
             raise ValueError(

@@ -158,6 +158,8 @@ def check_photographs(
     """
     if least_score is not None and not 0 <= least_score <= 1:
         raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
+    if category is not None and boxes is None:
+        raise ValueError("--box-category: needs --boxes")
     paths = find_photographs(folder)
     drawn_boxes = None if boxes is None else read_boxes(boxes, category)
     file = network_file(detector)

@@ -39,11 +39,12 @@ _LESS = (
     *("darker", "of less contrast", "paler", "colder in colour", "with less black", "with less white"),
     *("of less detail", "less noisy", "brighter below than above"),
 )
-_WIDTH_PX = 256
+# Strips are made shorter than they are.
+_WIDTH_PX, _TALLEST_PX = 256, 2048
 _BLACK, _WHITE = 0.05, 0.95
 # A level step of 8 bits, below which detail and noise cannot be told from rounding.
 _STEP = 1.0 / 255.0
-_COVERED_QUANTILE = 0.95
+_COVERED_QUANTILE, _LEAST_REACH = 0.95, 1e-9
 _MOST_PICTURES = 240
 
 
@@ -59,7 +60,7 @@ def measure_looks(picture: Pixels) -> Array:
     grey = color.mean(axis=2, dtype=np.float32) / np.float32(255.0)
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6.0
     noise = float(np.median(np.abs(cv2.filter2D(grey, -1, kernel)))) / 0.6745
-    size = _WIDTH_PX, max(2, round(_WIDTH_PX * grey.shape[0] / grey.shape[1]))
+    size = _WIDTH_PX, min(max(2, round(_WIDTH_PX * grey.shape[0] / grey.shape[1])), _TALLEST_PX)
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255.0)
     light = small.mean(axis=2)
     detail = float((light - cv2.GaussianBlur(light, (0, 0), 2.0)).std())
@@ -123,7 +124,8 @@ class KnownLooks:
         self._looks = (looks - self._mean) / self._scale
         gaps = np.linalg.norm(self._looks[:, None] - self._looks[None], axis=2)
         gaps[scene[:, None] == scene[None]] = np.inf
-        self._reach = float(np.quantile(gaps.min(axis=1), _COVERED_QUANTILE))
+        # Pictures that are all alike are near one another, and nothing else is.
+        self._reach = max(float(np.quantile(gaps.min(axis=1), _COVERED_QUANTILE)), _LEAST_REACH)
 
     def likeness(self, looks: Array) -> Likeness:
         """How a picture of (9,) looks compares with these."""

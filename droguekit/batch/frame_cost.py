@@ -306,8 +306,9 @@ class _DistanceFit:
         families = np.array([family_index(recipe, scene_of_frame(recipe, index)) for index in reports], dtype=np.intp)
         shows = np.isfinite(self._measured_m)
         # A family without a measured frame is represented by the average of the others.
-        shares = np.bincount(drawn.families[np.isfinite(self._drawn_m)], minlength=int(drawn.families.max()) + 1)
-        probes = np.bincount(families[shows], minlength=len(shares))
+        count = max(1, len(recipe.families))
+        shares = np.bincount(drawn.families[np.isfinite(self._drawn_m)], minlength=count)
+        probes = np.bincount(families[shows], minlength=count)
         # Frames without a drogue have a constant of their own.
         self._weights = np.where(shows, (shares / np.maximum(probes, 1))[families], 1.0)
 

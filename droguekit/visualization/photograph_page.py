@@ -15,6 +15,8 @@ from droguekit.scoring.report.html_page import page_template
 from droguekit.scoring.report.label_drawing import draw_box, jpeg_uri, resized
 
 _TILE_PX, _LINE_PX = 480, 2
+# A strip that is narrower than a tile would be beyond what JPEG can hold.
+_TALLEST_PX = 4000
 _MOST_TILES = 200
 HIT_RGB, FALSE_RGB, DRAWN_RGB, FOUND_RGB = (60, 200, 90), (235, 60, 50), (255, 205, 60), (70, 170, 255)
 """Colours of found boxes that are drogues, that are none, of drawn boxes, and of found ones that nobody judged."""
@@ -78,7 +80,8 @@ def _groups(found: PhotographCheck) -> Iterator[tuple[str, list[PhotographResult
 def _tile(folder: Path, one: PhotographResult) -> _Tile:
     picture = shown_photograph(folder / one.name)
     color = np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
-    tile, scale = resized(color, _TILE_PX)
+    height, width = color.shape[:2]
+    tile, scale = resized(color, max(1, min(_TILE_PX, _TALLEST_PX * width // height)))
     for box in one.drawn or ():
         draw_box(tile, box, scale, color=DRAWN_RGB, line_px=_LINE_PX)
     for found in reversed(one.found):

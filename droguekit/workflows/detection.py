@@ -78,7 +78,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         OSError: a file cannot be written.
         KeyboardInterrupt: the user asked to stop, and the state is saved.
     """
-    from datasets_manifest.importers.photographs import find_photographs
+    from datasets_manifest.importers.photographs import find_photographs, shown_photograph
     from datasets_manifest.recipe.recipe import RecipeSource
     from droguekit.batch.stop_request import StopRequest
     from nav.training.training_settings import build_settings, parse_size
@@ -104,7 +104,8 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
     check_training(out, settings, start)
     if options.photographs is not None:
-        find_photographs(options.photographs)
+        for path in find_photographs(options.photographs):
+            shown_photograph(path)
     datasets = [
         _render_source(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from nav.training.training_settings import SizePx
 
 # A photograph of at least so many times the network's input is also used in quarters, in which details stay visible.
 _QUARTERED_FROM = 1.5
+# A picture is a strip where less than one part in so many of it fills the input.
+_STRIP, _MARGIN_PX = 16, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,15 @@ def _cut_outs(picture: NDArray[np.uint8], size_px: SizePx) -> Iterator[Image]:
 
 def _filled(picture: Image, size_px: SizePx) -> Image:
     """The middle of a picture, as large as it fills the size."""
+    # Of a strip, only so much of the middle is enlarged as may be seen.
+    height, width = picture.shape[:2]
+    rows, columns = (
+        min(side, math.ceil(other * wanted / beside) + _MARGIN_PX)
+        for side, other, wanted, beside in ((height, width, *size_px), (width, height, *reversed(size_px)))
+    )
+    if rows < height / _STRIP or columns < width / _STRIP:
+        top, left = (height - rows) // 2, (width - columns) // 2
+        picture = picture[top : top + rows, left : left + columns]
     scale = max(size_px[0] / picture.shape[0], size_px[1] / picture.shape[1])
     shape = tuple(max(round(side * scale), wanted) for side, wanted in zip(picture.shape[:2], size_px, strict=True))
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR

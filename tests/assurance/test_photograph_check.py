@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from droguekit.assurance.picture_looks import LOOKS, KnownLooks, measure_looks
 from droguekit.batch.progress import progress_report
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.scoring.report.label_drawing import display_picture
+from nav.training.negative_photographs import read_photographs
 
 Make = Callable[..., Path]
 RECIPE = """
@@ -118,6 +120,8 @@ def test_the_command_writes_page_and_numbers(photographs: Path, rendered: Path, 
         (["{empty}"], "has no pictures"),
         (["{photographs}", "--detector", "color-blob"], "must be a network"),
         (["{photographs}", "--boxes", "{boxes}"], "none of its images is among these"),
+        (["{photographs}", "--box-category", "drogue"], "--box-category: needs --boxes"),
+        (["{hostile}"], "has a name that is not UTF-8; rename it"),
     ],
 )
 def test_wrong_input(
@@ -126,7 +130,10 @@ def test_wrong_input(
     (tmp_path / "empty").mkdir()
     table = {"images": [{"id": 1, "file_name": "other.png"}], "annotations": []}
     (tmp_path / "other.json").write_text(json.dumps(table))
-    places = {"none": tmp_path / "none", "empty": tmp_path / "empty", "photographs": photographs}
+    hostile = tmp_path / "hostile"
+    hostile.mkdir()
+    Path(os.fsdecode(bytes(hostile) + b"/\xff.png")).write_bytes(b"")
+    places = {"none": tmp_path / "none", "empty": tmp_path / "empty", "photographs": photographs, "hostile": hostile}
     given = [word.format(**places, boxes=tmp_path / "other.json") for word in words]
     assert run(["real-check", *given]) == WRONG_INPUT
     error = capsys.readouterr().err.strip().splitlines()[-1]
@@ -162,6 +169,25 @@ def pictures(count: int, brightness: float, seed: int) -> list[np.ndarray]:
         np.clip(brightness + rng.normal(0, 6) + ramp + rng.normal(0, 4, (96, 128, 3)), 0, 255).astype(np.uint8)
         for _ in range(count)
     ]
+
+
+def test_strips_are_checked_and_shown(tmp_path: Path) -> None:
+    """Pictures that are a thousand times as long as wide are drawn small, and looked at in part."""
+    folder = tmp_path / "strips"
+    folder.mkdir()
+    for name, shape in (("wide.png", (4, 4000)), ("tall.png", (4000, 4)), ("dot.png", (1, 1))):
+        assert cv2.imwrite(str(folder / name), np.full((*shape, 3), 90, np.uint8))
+    page = tmp_path / "page.html"
+    assert run(["real-check", str(folder), "--html", str(page)]) == DONE
+    assert page.read_text().count("<img") == 3
+    cuts = read_photographs(folder, (64, 96)).images
+    assert cuts.shape == (3, 64, 96, 3) and (cuts == 90).all()
+
+
+def test_pictures_that_all_look_alike_know_nothing_else() -> None:
+    known = KnownLooks(np.zeros((4, 9)), ["day"] * 4, [0, 0, 1, 1])
+    assert known.likeness(np.zeros(9)).is_covered
+    assert not known.likeness(np.ones(9)).is_covered
 
 
 def test_looks_measure_what_they_are_called() -> None:

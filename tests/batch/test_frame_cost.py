@@ -183,6 +183,28 @@ def test_families_without_a_measured_frame_count_as_the_others(seed: int) -> Non
     assert found.size_bytes == pytest.approx(12 * 1000, rel=1e-9)
 
 
+def test_a_probed_family_that_is_not_drawn_counts_for_nothing() -> None:
+    """Measurements may be of another number of pairs, in which a rare family's frame was drawn."""
+    families = [{"name": "day", "weight": 1}, {"name": "fog", "weight": 1}, {"name": "dusk", "weight": 1}]
+    recipe = build_recipe(name="rare", frames={"count": 60, "scenes": 60}, distance=between(2, 20), families=families)
+    plan = plan_recipe(recipe)
+    drawn = plan.drawn
+    keep = [place for place, family in enumerate(drawn.families) if family == 0]
+    fewer = replace(
+        drawn,
+        indices=tuple(drawn.indices[place] for place in keep),
+        distances_m=drawn.distances_m[keep],
+        families=drawn.families[keep],
+        scenes=drawn.scenes[keep],
+    )
+    dear = {index for index, family in zip(drawn.indices, drawn.families, strict=True) if family == 2}
+    probed = synthetic(recipe, plan, lambda index: 100.0 if index in dear else 1.0)
+    assert dear & set(probed.counted)
+    assert set(fewer.indices) & set(probed.counted)
+    found = estimate_cost(recipe, replace(plan, drawn=fewer), probed)
+    assert found.frames_s == pytest.approx(60 * 1.2, rel=1e-9)
+
+
 def test_the_standard_error_is_how_much_the_total_scatters() -> None:
     recipe = build_recipe(BASE)
     plan = plan_recipe(recipe)

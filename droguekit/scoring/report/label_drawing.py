@@ -41,7 +41,7 @@ def display_picture(images: StereoImages) -> Picture:
 def resized(picture: Picture, width_px: int) -> tuple[Picture, float]:
     """A copy of that width, and how much larger it is than the picture."""
     scale = width_px / picture.shape[1]
-    size = (width_px, round(picture.shape[0] * scale))
+    size = (width_px, max(1, round(picture.shape[0] * scale)))
     copy = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     return np.asarray(copy, dtype=np.uint8), scale
 

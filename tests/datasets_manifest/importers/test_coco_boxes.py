@@ -53,6 +53,12 @@ def test_a_name_that_fits_two_views_is_refused(name: str, tmp_path: Path) -> Non
         drawn.of_views([("left/1.png", "right/1.png")], VIEW)
 
 
+def test_a_whole_name_is_no_part_of_another(tmp_path: Path) -> None:
+    path = boxes(tmp_path, ("1.png", [1, 2, 3, 4]), ("left/1.png", [5, 6, 7, 8]))
+    found = read_boxes(path).of_images(["1.png", "left/1.png"], [VIEW, VIEW])
+    assert found == {0: ((0.5, 1.5, 3, 4),), 1: ((4.5, 5.5, 7, 8),)}
+
+
 @pytest.mark.parametrize("name", ["2-1.png", "21.png", "flight7_left_1.png", "right/left_1.jpg"])
 def test_boxes_of_other_images_alone_are_refused(name: str, tmp_path: Path) -> None:
     drawn = read_boxes(boxes(tmp_path, (name, [1, 2, 3, 4])))
