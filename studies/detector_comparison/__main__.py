@@ -147,13 +147,13 @@ def _compare(options: ComparisonOptions, out: Path, ours: Mapping[str, Detector]
     if options.image_passes:
         length = training_length(options.image_passes, training_image_count(options.corpus))
         recorded["peer_image_passes"] = str(length.image_passes)
-        # Without a drogue in the test split there is nothing to draw.
-        if all(row["ap"] is not None for row in rows.values()):
-            write_accuracy_plot(rows, PEERS, out / "accuracy.png")
-            say(f"wrote {out / 'accuracy.png'}")
     write_text_atomic(
         out / "comparison.json", json.dumps({"schema": 1, "order": recorded, "detectors": rows}, indent=1) + "\n"
     )
+    # Without a drogue in the test split there is nothing to draw.
+    if options.image_passes and all(row["ap"] is not None for row in rows.values()):
+        write_accuracy_plot(rows, PEERS, out / "accuracy.png")
+        say(f"wrote {out / 'accuracy.png'}")
     return rows
 
 

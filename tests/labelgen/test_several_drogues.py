@@ -23,7 +23,7 @@ from labelgen.export.export_log import ExportLog
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
 from labelgen.validation.dataset_checks import validate_dataset
 from studies.detector_comparison.ultralytics_peers import export_corpus
-from tests.support.batch_datasets import render_recipe
+from tests.support.batch_datasets import FEWEST_RAYS, render_recipe
 from tests.support.recipe_builder import RIG_320_PX, recipe_text, stations
 
 
@@ -41,15 +41,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         hose={},
         receiver={"nose_scene_fraction": 0.5},
         neighbours={"scene_fraction": 1.0, "distance_fraction": [1.2, 1.6]},
-        # Labels ask where surfaces lie and not for their light.
-        render={
-            "samples_per_px": 1,
-            "open_samples_per_px": 1,
-            "edge_samples_per_px": 1,
-            "surround_samples_per_px": 1,
-            "max_depth": 2,
-            "denoise": False,
-        },
+        render={**FEWEST_RAYS, "denoise": False},
     )
     folder: Path = tmp_path_factory.mktemp("several") / "dataset"
     render_recipe(folder, workers=0, text=text)

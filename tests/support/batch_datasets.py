@@ -22,6 +22,15 @@ from tests.support.shared_folder import shared_folder
 # Every process that renders ground computes its texture first, for seconds; a picture of sky and ground costs nothing.
 PLAIN_SKY = {"map": {"file": str(Path(__file__).with_name("plain_sky.hdr")), "cd_m2_per_unit": 1000.0}}
 
+# For what asks where surfaces lie and not for their light.
+FEWEST_RAYS = {
+    "samples_per_px": 1,
+    "open_samples_per_px": 1,
+    "edge_samples_per_px": 1,
+    "surround_samples_per_px": 1,
+    "max_depth": 2,
+}
+
 # Four pairs of 320 x 240 pixels.
 TINY_RECIPE = recipe_text(
     name="tiny",
@@ -30,13 +39,7 @@ TINY_RECIPE = recipe_text(
     frames={"count": 4, "scenes": 2},
     distance=between(3.0, 12.0, "log-uniform"),
     environment=PLAIN_SKY,
-    render={
-        "samples_per_px": 1,
-        "open_samples_per_px": 1,
-        "edge_samples_per_px": 1,
-        "surround_samples_per_px": 1,
-        "max_depth": 2,
-    },
+    render=FEWEST_RAYS,
     split={"train": 0.5, "test": 0.5},
 )
 
