@@ -5,9 +5,9 @@ of the low corner, width, height, counted from the corner of the image: the whol
 round, so the ellipse in its box is what rotates. Source of the mosaic: Bochkovskiy et al. 2020, arXiv:2004.10934,
 section 3.3; the seed paper trains with it.
 
-Photometric: colour jitter, blur, noise, sharpening and JPEG, and shapes painted as occluders and distractors. Images
-are encoded by the sRGB curve whatever the dataset's sensor (`nav.detector.input_image`), and gains multiply encoded
-values: half the value is about a fifth of the light.
+Photometric: colour jitter, blur, noise, sharpening and JPEG. Images are encoded by the sRGB curve whatever the
+dataset's sensor (`nav.detector.input_image`), and gains multiply encoded values: half the value is about a fifth of
+the light.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ Image = NDArray[np.uint8]
 
 MIN_VISIBLE_FRACTION = 0.3
 """A drogue of which a view shows less is painted over, for nobody would call what is left a drogue."""
-# Longer side over the canvas's height: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.5 and 11 px.
+SMALLEST_LEARNED_FRACTION = 0.018
+"""Longer side over the canvas's height: 9 px of 480.
+
+Views are drawn for an image's first drogue; those beside it may become too small to tell them from anything else.
+"""
+# Of an image's first drogue: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.5 and 11 px.
 _SMALLEST_BOX_FRACTION = 0.027
 _LARGEST_BOX_FRACTION = 1.2  # longer side over the window's shorter one; larger boxes are mostly cut off
 _SHIFT_FRACTION = 0.9  # of the range in which the crop can move while it contains the drogue's centre
@@ -178,16 +183,24 @@ def clip_boxes(boxes: Boxes, window: CanvasWindow) -> tuple[Boxes, NDArray[np.fl
     return np.hstack([low, high - low]), fractions
 
 
-def paint_view(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Boxes:
+def paint_view(canvas: Image, image: Image, boxes: Boxes, view: ImageView, smallest_px: float = 0.0) -> Boxes:
     """Paint a view on the canvas, and clip the image's boxes to it.
 
+    Args:
+        canvas: (H, W, 3), changed in place.
+        image: (h, w, 3).
+        boxes: (n, 4) of the drogues in the image.
+        view: where the image comes on the canvas.
+        smallest_px: longer side of the smallest box on the canvas that is large enough. [px]
+
     Returns:
-        (m, 4) visible parts of the drogues that are visible enough. The visible parts of other drogues are painted
-        grey, so that no drogue on the canvas lacks a box.
+        (m, 4) visible parts of the drogues that are visible and large enough. The visible parts of other drogues are
+        painted grey, so that no drogue on the canvas lacks a box.
     """
     warp_view(canvas, image, view)
     visible, fractions = clip_boxes(transform_boxes(boxes, view), view.window)
-    kept = fractions >= MIN_VISIBLE_FRACTION
+    large_enough = visible[:, 2:].max(axis=1, initial=0.0) >= smallest_px
+    kept: NDArray[np.bool_] = (fractions >= MIN_VISIBLE_FRACTION) & large_enough
     for x, y, width, height in visible[~kept & (fractions > 0)]:
         canvas[int(y) : int(np.ceil(y + height)), int(x) : int(np.ceil(x + width))] = PADDING_DN
     return visible[kept]
@@ -235,18 +248,6 @@ _LOW_LIGHT_NOISE_DN = (2.0, 8.0)
 _RESAMPLED_FRACTION, _RESAMPLED_SCALE = 0.12, (0.35, 0.8)
 _SHARPENED_FRACTION, _SHARPENED_AMOUNT, _SHARPENED_SIGMA_PX = 0.12, (0.3, 1.5), 1.0
 _COMPRESSED_FRACTION, _JPEG_QUALITY = 0.25, (20, 95)
-
-_OCCLUDED_FRACTION = 0.12  # of the drogues
-_MAX_HIDDEN_FRACTION = 0.45  # of a drogue's ellipse; an occluder that would hide more of any drogue is not painted
-_DISTRACTED_FRACTION = 0.3  # of the canvases
-_MAX_DISTRACTORS = 3
-_DISTRACTOR_SIZE = (0.02, 0.6)  # over the canvas's height
-_RING_TUBE_FRACTION = (0.08, 0.3)  # radius of a ring's tube over the radius of the ring
-_MIN_TUBE_PX = 0.5
-_RING_AMBIENT_FRACTION = (0.2, 0.9)  # brightness of the side that faces away from the lamp, over that which faces it
-# Red and orange (paint, lamps), white, dark: the colours of drogues, markers, pods and probes.
-_COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35, 38), (120, 122, 125))
-_COLOR_SPREAD = 20
 
 
 def color_jitter(rng: np.random.Generator, image: Image) -> Image:
@@ -338,161 +339,3 @@ def _add_noise(rng: np.random.Generator, image: Image, sigma_dn: float) -> Image
     noise += image
     np.rint(noise, out=noise)
     return np.clip(noise, 0, 255, out=noise).astype(np.uint8)
-
-
-def cutout(rng: np.random.Generator, image: Image, boxes: Boxes) -> Boxes:
-    """Paint a bar over some of the drogues, as an occluder.
-
-    Args:
-        rng: random stream.
-        image: (H, W, 3), changed in place.
-        boxes: (n, 4) of the drogues in it.
-
-    Returns:
-        (n, 4) boxes of the parts that remain visible.
-    """
-    remaining = boxes.copy()
-    hidden = np.zeros(image.shape[:2], dtype=np.uint8)
-    for box in boxes:
-        # All draws are made for every box, so that later draws do not depend on what is painted.
-        is_occluded, corners, color = rng.random() < _OCCLUDED_FRACTION, _sample_occluder(rng, box), _sample_color(rng)
-        if not is_occluded:
-            continue
-        hidden_with = hidden.copy()
-        cv2.fillConvexPoly(hidden_with, corners, 1)
-        # It may also hide other drogues, together with the occluders painted so far.
-        left = [_visible_box(hidden_with, each) for each in boxes]
-        visible = [each for each in left if each is not None]
-        if len(visible) == len(boxes):
-            image[hidden_with > hidden] = color
-            hidden, remaining = hidden_with, np.array(visible)
-    return remaining
-
-
-def _sample_occluder(rng: np.random.Generator, box: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(4, 2) corners of a bar over the box; a short one hides a part of its width only."""
-    center, size = box[:2] + box[2:] * rng.uniform(0, 1, 2), float(box[2:].max())
-    angle, width, length = rng.uniform(0, np.pi), size * rng.uniform(0.08, 0.5), size * rng.uniform(0.4, 3)
-    along = np.array([np.cos(angle), np.sin(angle)]) * length / 2
-    across = np.array([-np.sin(angle), np.cos(angle)]) * width / 2
-    corners = [along + across, along - across, -along - across, -along + across]
-    rounded: NDArray[np.int32] = np.rint(center + np.array(corners)).astype(np.int32)
-    return rounded
-
-
-def _sample_color(rng: np.random.Generator) -> NDArray[np.uint8]:
-    color = np.array(_COLORS[rng.integers(len(_COLORS))]) * rng.uniform(0.4, 1.1)
-    return np.clip(color + rng.uniform(-_COLOR_SPREAD, _COLOR_SPREAD, 3), 0, 255).astype(np.uint8)
-
-
-def _visible_box(hidden: NDArray[np.uint8], box: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The box of the part of a box's ellipse that occluders leave visible; None where too little is left."""
-    low = np.floor(box[:2]).astype(int)
-    high = np.minimum(np.ceil(box[:2] + box[2:]).astype(int), hidden.shape[::-1])
-    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
-    center, halves = box[:2] + box[2:] / 2, box[2:] / 2
-    ellipse = ((x - center[0]) / halves[0]) ** 2 + ((y - center[1]) / halves[1]) ** 2 <= 1
-    visible = ellipse & (hidden[low[1] : high[1], low[0] : high[0]] == 0)
-    if visible.sum() < (1 - _MAX_HIDDEN_FRACTION) * ellipse.sum() or not visible.any():
-        return None
-    # An edge moves where its outermost rows or columns are hidden; otherwise it keeps its sub-pixel position.
-    edges = []
-    for axis in (0, 1):
-        before, after = np.flatnonzero(ellipse.any(axis=axis)), np.flatnonzero(visible.any(axis=axis))
-        low_edge, high_edge = box[axis], box[axis] + box[2 + axis]
-        edges.append(
-            (
-                low_edge if after[0] == before[0] else float(low[axis] + after[0]),
-                high_edge if after[-1] == before[-1] else float(low[axis] + after[-1] + 1),
-            )
-        )
-    (x_low, x_high), (y_low, y_high) = edges
-    return np.array([x_low, y_low, x_high - x_low, y_high - y_low])
-
-
-def paint_distractors(rng: np.random.Generator, image: Image, boxes: Boxes) -> None:
-    """Paint discs, rings and bars beside the drogues, in a drogue's colours; they get no boxes."""
-    if rng.random() >= _DISTRACTED_FRACTION:
-        return
-    height, width = image.shape[:2]
-    for _ in range(int(rng.integers(1, _MAX_DISTRACTORS + 1))):
-        size = float(np.exp(rng.uniform(*np.log(_DISTRACTOR_SIZE)))) * height
-        center, axes = rng.uniform(0, (width, height)), size / 2 * rng.uniform(0.5, 1, 2)
-        turn_deg, kind, color = rng.uniform(0, 180), rng.integers(3), _sample_color(rng).tolist()
-        tube, ambient, toward_lamp = _sample_ring(rng)
-        if _touches_drogue(center, size, boxes):
-            continue
-        at, halves = (round(center[0]), round(center[1])), (max(round(axes[0]), 1), max(round(axes[1]), 1))
-        if kind == 0:
-            cv2.ellipse(image, at, halves, turn_deg, 0, 360, color, -1, cv2.LINE_AA)
-        elif kind == 1:
-            ring = axes / (1 + tube)
-            tube_px = max(tube * float(ring.max()), _MIN_TUBE_PX)
-            paint_ring(image, center, ring, turn_deg, tube_px, color, ambient, toward_lamp)
-        else:
-            corners = cv2.boxPoints((center.tolist(), (2 * axes[0], axes[1] / 2), turn_deg))
-            cv2.fillConvexPoly(image, np.rint(corners).astype(np.int32), color, cv2.LINE_AA)
-
-
-def _sample_ring(rng: np.random.Generator) -> tuple[float, float, NDArray[np.float64]]:
-    """Radius of the tube over that of the ring, fraction of ambient light, direction to the lamp."""
-    tube, ambient = float(rng.uniform(*_RING_TUBE_FRACTION)), float(rng.uniform(*_RING_AMBIENT_FRACTION))
-    toward_lamp = rng.standard_normal(3)
-    toward_lamp[2] = abs(toward_lamp[2])
-    return tube, ambient, toward_lamp / np.linalg.norm(toward_lamp)
-
-
-def _touches_drogue(center: NDArray[np.float64], size: float, boxes: Boxes) -> bool:
-    """Whether a shape would cover or touch a drogue."""
-    low, high = boxes[:, :2] - size, boxes[:, :2] + boxes[:, 2:] + size
-    return bool(((center > low) & (center < high)).all(axis=1).any())
-
-
-def paint_ring(
-    image: Image,
-    center_px: NDArray[np.float64],
-    half_axes_px: NDArray[np.float64],
-    turn_deg: float,
-    tube_px: float,
-    color: Sequence[int],
-    ambient_fraction: float,
-    toward_lamp: NDArray[np.float64],
-) -> None:
-    """Paint a matt torus seen from a distance: of all plain shapes a ring looks most like a drogue.
-
-    The tube has the same width all around: a tilted ring is flatter, its tube is not. Distances to the ellipse are a
-    first-order approximation, accurate near it (Sampson 1982, doi:10.1016/0146-664X(82)90101-0).
-
-    Args:
-        image: (H, W, 3), changed in place.
-        center_px: (2,) x, y.
-        half_axes_px: (2,) of the ellipse along the middle of the tube, above 0.
-        turn_deg: angle from the image's x axis to the first half axis, towards y.
-        tube_px: radius of the tube.
-        color: red, green, blue of the side that faces the lamp.
-        ambient_fraction: relative brightness of the side that faces away from it, 0 to 1.
-        toward_lamp: (3,) unit vector to the lamp: x, y of the image, and towards the camera.
-    """
-    height, width = image.shape[:2]
-    reach = float(half_axes_px.max()) + tube_px + 1
-    low = np.maximum(np.floor(center_px - reach).astype(int), 0)
-    high = np.minimum(np.ceil(center_px + reach).astype(int), (width, height))
-    if (low >= high).any():
-        return
-    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float32) + 0.5
-    turn = np.radians(turn_deg)
-    along = (x - center_px[0]) * np.cos(turn) + (y - center_px[1]) * np.sin(turn)
-    across = (y - center_px[1]) * np.cos(turn) - (x - center_px[0]) * np.sin(turn)
-    radius = np.maximum(np.hypot(along / half_axes_px[0], across / half_axes_px[1]), 1e-6)
-    slope_along, slope_across = along / half_axes_px[0] ** 2 / radius, across / half_axes_px[1] ** 2 / radius
-    slope = np.maximum(np.hypot(slope_along, slope_across), 1e-6)
-    distance_px = (radius - 1) / slope
-    cover = np.clip(tube_px + 0.5 - np.abs(distance_px), 0, 1)[..., None]
-    outwards = np.clip(distance_px / tube_px, -1, 1)
-    normal_x = (slope_along * np.cos(turn) - slope_across * np.sin(turn)) / slope * outwards
-    normal_y = (slope_along * np.sin(turn) + slope_across * np.cos(turn)) / slope * outwards
-    facing = normal_x * toward_lamp[0] + normal_y * toward_lamp[1] + np.sqrt(1 - outwards**2) * toward_lamp[2]
-    brightness = ambient_fraction + (1 - ambient_fraction) * np.clip(facing, 0, 1)
-    painted = np.array(color) * brightness[..., None]
-    patch = image[low[1] : high[1], low[0] : high[0]]
-    patch[:] = np.rint(patch * (1 - cover) + painted * cover)

@@ -41,7 +41,7 @@ from nav.training.training_settings import SizePx, size_text
 
 EyeIndex = int
 """0 the left eye, 1 the right."""
-_VERSION = 3  # incremented with every change of a cache's contents
+_VERSION = 4  # incremented with every change of a cache's contents
 _IMAGES_FILE, _OPACITIES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "opacities.npy", "index.json", ".lock"
 _LOCK_POLL_S = 0.2
 _PHOTOGRAPHS = "photographs"

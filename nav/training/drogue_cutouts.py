@@ -33,7 +33,9 @@ _GAIN, _GAMMA, _SATURATION = (0.3, 1.6), (0.6, 2.0), (0.0, 1.5)
 _GREY_FRACTION, _NEGATIVE_FRACTION = 0.3, 0.1
 _MARGIN_PX = 4  # beside a cut-out, for its soft edge
 _LEAST_CONTRAST_DN = 25.0  # a drogue that would hardly be seen is shown as its negative
-_CLEARANCE = 1.2  # of the boxes of an image, so much times as large, a pasted drogue touches none
+# What may stand before a drogue; where it is within the box, it may hide the drogue's middle and no edge.
+_HIDING_PARTS = (int(Part.PROBE), int(Part.OBSTACLE), int(Part.DISTRACTOR))
+_INSET = 0.4  # of half its size the centre of a pasted drogue is away from the image's edges: half of it is in view
 
 
 class Cutout(FrozenModel):
@@ -103,6 +105,9 @@ def cut_out(
     x, y, width, height = placement.to_input(visible)[0]
     if np.abs(sides).max() > _WHOLE_WITHIN_PX or max(width, height) < _SMALLEST_PX:
         return None
+    first, last = np.floor(visible[:2]).astype(int), np.ceil(visible[:2] + visible[2:]).astype(int)
+    if np.isin(part_ids[first[1] : last[1], first[0] : last[0]], _HIDING_PARTS).any():
+        return None
     opaque = np.where(np.isin(part_ids, _PARTS), np.uint8(255), np.uint8(0))
     size = tuple(round(side * scale) for side, scale in zip(opaque.shape[::-1], placement.scale, strict=True))
     interpolation = cv2.INTER_LINEAR if placement.scale[0] > 1 else cv2.INTER_AREA
@@ -118,7 +123,7 @@ def cut_out(
 
 
 def sample_paste(rng: np.random.Generator, pair: int, box: Boxes, image_wh: tuple[int, int]) -> Paste:
-    """Draw size, place and look of a pasted drogue; its centre lies in the image.
+    """Draw size, place and look of a pasted drogue; at least about half of it lies in the image.
 
     Args:
         rng: random stream.
@@ -130,7 +135,8 @@ def sample_paste(rng: np.random.Generator, pair: int, box: Boxes, image_wh: tupl
     smallest_px, largest_px = (fraction * image_wh[1] for fraction in _PASTED_SIZE)
     largest_px = max(min(largest_px, _MOST_ENLARGED * longest_px), smallest_px)
     scale = float(np.exp(rng.uniform(np.log(smallest_px), np.log(largest_px)))) / longest_px
-    center = rng.uniform(0, image_wh)
+    inset = np.minimum(_INSET * scale * box[2:] / 2, np.array(image_wh) / 2)
+    center = rng.uniform(inset, image_wh - inset)
     return Paste(pair, scale, (float(center[0]), float(center[1])), _sample_look(rng))
 
 
@@ -141,9 +147,15 @@ def _sample_look(rng: np.random.Generator) -> Look:
 
 
 def is_clear(pasted: Boxes, others: Boxes) -> bool:
-    """Whether a pasted drogue (1, 4) touches none of other boxes (n, 4), with some distance."""
-    apart = np.abs(others[:, :2] + others[:, 2:] / 2 - pasted[:, :2] - pasted[:, 2:] / 2)
-    return bool((apart > _CLEARANCE * (others[:, 2:] + pasted[:, 2:]) / 2).any(axis=1).all())
+    """Whether a pasted rectangle (4,), drogue and hose, touches none of other boxes (n, 4)."""
+    apart = np.abs(others[:, :2] + others[:, 2:] / 2 - pasted[:2] - pasted[2:] / 2)
+    return bool((apart > (others[:, 2:] + pasted[2:]) / 2).any(axis=1).all())
+
+
+def pasted_rectangle(box: Boxes, cutout: Cutout, paste: Paste) -> Boxes:
+    """(4,) rectangle that a pasted drogue and its hose cover, from its box (4,) and cut-out in its own image. [px]"""
+    corner = paste.center_px + paste.scale * (np.array([cutout.x, cutout.y]) - box[:2] - box[2:] / 2)
+    return np.hstack([corner, paste.scale * np.array([cutout.width, cutout.height])])
 
 
 def pasted_box(box: Boxes, paste: Paste, image_wh: tuple[int, int]) -> Boxes:
@@ -171,10 +183,10 @@ def paste_drogue(background: Image, image: Image, box: Boxes, cutout: Cutout, al
         pixels = np.asarray(cv2.resize(pixels, wanted, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         opacity = np.asarray(cv2.resize(opacity, wanted, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     scale = paste.scale * np.array([cutout.width / pixels.shape[1], cutout.height / pixels.shape[0]])
-    corner = paste.center_px + paste.scale * (np.array([cutout.x, cutout.y]) - box[:2] - box[2:] / 2)
+    corner, size_px = np.split(pasted_rectangle(box, cutout, paste), 2)
     result = background.copy()
     low = np.maximum(np.floor(corner).astype(int) - _MARGIN_PX, 0)
-    high = np.ceil(corner + paste.scale * np.array([cutout.width, cutout.height])).astype(int) + _MARGIN_PX
+    high = np.ceil(corner + size_px).astype(int) + _MARGIN_PX
     part = result[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
     if not part.size:
         return result

@@ -25,6 +25,7 @@ from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
 from nav.detector.network.head import DetectionLoss, LossWeights, detection_loss
 from nav.training.augmentation import (
+    SMALLEST_LEARNED_FRACTION,
     TILES,
     Boxes,
     CanvasWindow,
@@ -32,16 +33,22 @@ from nav.training.augmentation import (
     ImageView,
     ViewRanges,
     color_jitter,
-    cutout,
-    paint_distractors,
     paint_view,
     sample_mosaic,
     sample_view,
     whole_view,
 )
 from nav.training.corpus import Corpus, EyeIndex
-from nav.training.drogue_cutouts import Paste, is_clear, paste_drogue, pasted_box, sample_paste
+from nav.training.drogue_cutouts import (
+    Paste,
+    is_clear,
+    paste_drogue,
+    pasted_box,
+    pasted_rectangle,
+    sample_paste,
+)
 from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
+from nav.training.painted_shapes import paint_distractors, paint_occluders
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurves, TrainingObserver, write_tables
 from nav.training.training_settings import SizePx, TrainingSettings
@@ -152,9 +159,11 @@ class BatchMaker:
             return members
         pair = int(corpus.pairs_to_cut[rng.integers(len(corpus.pairs_to_cut))])
         paste = sample_paste(rng, pair, corpus.boxes(pair, 0)[0], corpus.size_px[::-1])
-        pasted = [member._replace(paste=paste) for member in members]
-        boxes = [self._boxes(member) for member in pasted]
-        return pasted if all(is_clear(own[:1], own[1:]) for own in boxes) else members
+        for member in members:
+            box, (cut, _) = corpus.boxes(pair, member.eye)[0], corpus.opacity(pair, member.eye)
+            if not is_clear(pasted_rectangle(box, cut, paste), corpus.boxes(member.pair, member.eye)):
+                return members
+        return [member._replace(paste=paste) for member in members]
 
     def _members(self, sample: int) -> list[Member]:
         """Pair and eye of each image of a sample."""
@@ -198,12 +207,12 @@ class BatchMaker:
     ) -> tuple[Image, Boxes]:
         canvas = np.full((*size, 3), PADDING_DN, dtype=np.uint8)
         shown = [
-            paint_view(canvas, self._image(member), self._boxes(member), view)
+            paint_view(canvas, self._image(member), self._boxes(member), view, SMALLEST_LEARNED_FRACTION * size[0])
             for member, view in zip(members, views, strict=True)
         ]
         boxes = np.vstack(shown)
         paint_distractors(rng, canvas, boxes)
-        boxes = cutout(rng, canvas, boxes)
+        boxes = paint_occluders(rng, canvas, boxes)
         return color_jitter(rng, canvas), boxes
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from datasets_manifest.importers.image_files import IMAGE_SUFFIXES
 from datasets_manifest.importers.photographs import shown_photograph
@@ -87,6 +88,8 @@ def fetch_photographs(folder: Path, packages: tuple[str, ...]) -> None:
 def unpack_photographs(archive: Path, folder: Path) -> None:
     """Write the photographs of a Debian package as JPEG of at most 1600 px.
 
+    Pictures with transparent places are left out: they are drawings and themes, not photographs.
+
     Args:
         archive: the `.deb` file.
         folder: is made anew.
@@ -100,7 +103,7 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
         _run(["dpkg-deb", "--extract", str(archive.resolve()), place], Path(place), archive.name)
         for title, path in sorted(_photograph_titles(Path(place)).items()):
             picture = shown_photograph(path)
-            if min(picture.shape[:2]) < _SMALLEST_SIDE_PX:
+            if _is_transparent(path) or min(picture.shape[:2]) < _SMALLEST_SIDE_PX:
                 continue
             scale = min(LARGEST_SIDE_PX / max(picture.shape[:2]), 1.0)
             size_px = (round(scale * picture.shape[1]), round(scale * picture.shape[0]))
@@ -118,6 +121,12 @@ def _run(command: list[str], place: Path, package: str) -> None:
     if ended.returncode != 0:
         reason = ended.stderr.strip().splitlines()[-1:] or ["no message"]
         raise OSError(f"{package}: {command[0]} ended with {ended.returncode}: {reason[0]}")
+
+
+def _is_transparent(path: Path) -> bool:
+    with Image.open(path) as picture:
+        lowest = picture.convert("RGBA").getchannel("A").getextrema()[0] if picture.has_transparency_data else 255
+    return lowest != 255
 
 
 def _photograph_titles(unpacked: Path) -> dict[str, Path]:

@@ -13,8 +13,20 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import MAX_MARKERS, Part, drogue_part_ids
 from droguekit.batch.progress import PlainProgress
+from nav.detector.input_image import letterbox
 from nav.training.corpus import Corpus, open_corpus
-from nav.training.drogue_cutouts import Cutout, Look, Paste, _repaint, is_clear, paste_drogue, pasted_box, sample_paste
+from nav.training.drogue_cutouts import (
+    Cutout,
+    Look,
+    Paste,
+    _repaint,
+    cut_out,
+    is_clear,
+    paste_drogue,
+    pasted_box,
+    pasted_rectangle,
+    sample_paste,
+)
 from nav.training.negative_photographs import Photographs
 from nav.training.trainer import BatchMaker
 from nav.training.training_settings import build_settings
@@ -52,6 +64,17 @@ def test_drogues_that_are_cut_off_or_hidden_stay_where_they_are(toy_corpus: Corp
             assert pair not in cut
 
 
+def test_a_drogue_with_something_before_its_middle_stays_where_it_is(toy_corpus: Corpus, toy_dataset: Path) -> None:
+    dataset, pair = Dataset(toy_dataset), int(toy_corpus.pairs_to_cut[0])
+    frame_index = toy_corpus.entry(pair).frame_index
+    view, ids = dataset.record(frame_index).views.left, dataset.part_ids(frame_index, "left").copy()
+    placement = letterbox(ids.shape[::-1], SIZE[::-1])
+    assert cut_out(ids, view, placement, SIZE[::-1]) is not None
+    x, y, width, height = view.box_visible_xywh_px
+    ids[int(y + height / 2), int(x + width / 2)] = Part.PROBE
+    assert cut_out(ids, view, placement, SIZE[::-1]) is None
+
+
 @pytest.mark.parametrize(("scale", "center"), [(1.0, (60.3, 40.8)), (0.41, (100.0, 20.5)), (1.5, (64.0, 50.0))])
 def test_a_pasted_drogue_lies_in_its_box(scale: float, center: tuple[float, float]) -> None:
     image = np.zeros((96, 128, 3), np.uint8)
@@ -85,11 +108,11 @@ def test_drawn_drogues_are_neither_tiny_nor_much_enlarged() -> None:
     longest = np.array([paste.scale * 30 for paste in pastes])
     assert 0.03 * 96 <= longest.min() < 4 and 40 < longest.max() <= 45
     centers = np.array([paste.center_px for paste in pastes])
-    assert (
-        (centers >= 0).all()
-        and (centers <= (128, 96)).all()
-        and centers.std(axis=0) == pytest.approx((37, 28), rel=0.15)
-    )
+    assert (centers >= 0).all() and (centers <= (128, 96)).all()
+    assert centers.std(axis=0) == pytest.approx((37, 28), rel=0.15)
+    areas = [pasted_box(box, paste, (128, 96))[0, 2:].prod() / (600 * paste.scale**2) for paste in pastes]
+    # Half of the box is 0.7 of it along both axes, in a corner; at an edge no less.
+    assert min(areas) >= 0.49
 
 
 def test_a_drogue_that_would_not_be_seen_is_shown_as_its_negative() -> None:
@@ -102,11 +125,26 @@ def test_a_drogue_that_would_not_be_seen_is_shown_as_its_negative() -> None:
     assert shown[40, 60].tolist() == [15, 15, 15] and shown[90, 120].tolist() == [250, 250, 250]
 
 
-@pytest.mark.parametrize(("x", "clear"), [(40.0, False), (61.0, False), (65.0, True)])
+@pytest.mark.parametrize(("x", "clear"), [(40.0, False), (59.0, False), (61.0, True)])
 def test_pasted_drogues_touch_no_other(x: float, clear: bool) -> None:
     others = np.array([[20.0, 20.0, 40.0, 40.0], [300.0, 300.0, 10.0, 10.0]])
-    assert is_clear(np.array([[x, 50.0, 2.0, 2.0]]), others) is clear
-    assert is_clear(np.array([[x, 50.0, 2.0, 2.0]]), np.zeros((0, 4)))
+    assert is_clear(np.array([x, 50.0, 2.0, 2.0]), others) is clear
+    assert is_clear(np.array([x, 50.0, 2.0, 2.0]), np.zeros((0, 4)))
+
+
+def test_a_pasted_rectangle_covers_all_that_is_pasted() -> None:
+    rng = np.random.default_rng(0)
+    image, box = np.full((96, 128, 3), 250, np.uint8), np.array([40.0, 30.0, 20.0, 20.0])
+    # The hose leaves to the right and below.
+    cutout, alpha = Cutout(x=35, y=25, width=60, height=50, offset=0), np.full((50, 60), 255, np.uint8)
+    for _ in range(50):
+        paste = sample_paste(rng, 0, box, (128, 96))
+        x, y, width, height = pasted_rectangle(box, cutout, paste)
+        shown = paste_drogue(np.zeros((96, 128, 3), np.uint8), image, box, cutout, alpha, paste)
+        at = np.argwhere(shown.any(axis=2))[:, ::-1]
+        # The edge is soft: 0.6 px of blur reach over two pixels.
+        assert (at >= np.array([x, y]) - 4).all() and (at <= np.array([x + width, y + height]) + 4).all()
+        assert len(at)
 
 
 def test_looks_change_colours_as_they_say() -> None:

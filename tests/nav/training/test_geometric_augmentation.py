@@ -117,6 +117,14 @@ def test_a_drogue_at_the_edge_keeps_its_visible_part() -> None:
     np.testing.assert_allclose(kept, [[100.0, 40.0, 20.0, 36.0]], atol=1e-9)  # sums of a few numbers
 
 
+def test_a_drogue_that_is_too_small_to_learn_from_is_painted_over() -> None:
+    reduced = ImageView(np.eye(2) * 0.25, np.zeros(2), CanvasWindow(0, 0, 120, 120))
+    for smallest_px, count in ((13.0, 0), (12.0, 1), (0.0, 1)):
+        canvas = np.zeros((120, 120, 3), np.uint8)
+        assert len(paint_view(canvas, ellipse_image(), BOX, reduced, smallest_px)) == count
+        assert (canvas > PADDING_DN).any() == bool(count)
+
+
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 def test_turning_an_ellipse_against_its_outline(flip: float) -> None:
     angle = np.radians(23)

@@ -41,11 +41,16 @@ def test_each_photograph_comes_once_and_reduced(tmp_path: Path) -> None:
     write_noise(share / "backgrounds" / "meadow.jpg", 420, 500)
     write_noise(share / "icons" / "button.png", 128, 128)
     write_noise(share / "backgrounds" / "banner.png", 200, 1000)
+    drawing = np.full((450, 450, 4), 255, np.uint8)
+    drawing[..., :3] = np.random.default_rng(1).integers(0, 256, (450, 450, 3))
+    assert cv2.imwrite(str(share / "backgrounds" / "opaque.png"), drawing)
+    drawing[:50, :50, 3] = 0
+    assert cv2.imwrite(str(share / "backgrounds" / "drawing.png"), drawing)
     (share / "backgrounds" / "notes.txt").write_text("no picture" * 10_000)
     (share / "backgrounds" / "link.jpg").symlink_to("meadow.jpg")
     unpack_photographs(build_package(tmp_path / "package"), tmp_path / "out")
     shapes = {path.name: cv2.imread(str(path)).shape for path in (tmp_path / "out").iterdir()}
-    assert shapes == {"Lake-contents.jpg": (400, 1600, 3), "meadow.jpg": (420, 500, 3)}
+    assert shapes == {"Lake-contents.jpg": (400, 1600, 3), "meadow.jpg": (420, 500, 3), "opaque.jpg": (450, 450, 3)}
 
 
 def test_only_photographs_of_the_examples_of_opencv_are_taken(tmp_path: Path) -> None:
