@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import beta, binom, norm, t
 
@@ -156,14 +156,21 @@ def block_percentile_limit(values: ArrayLike, blocks: Sequence[int], percent: fl
     names = sorted(set(blocks))
     if len(names) < 2:
         return value, limit
-    of_block = np.asarray(blocks)
-    parts = [sizes[of_block == name] for name in names]
-    rng = named_generator(key)
+    chosen = named_generator(key).integers(0, len(names), (RESAMPLES, len(names)))
+    order = np.argsort(sizes)
+    place = np.unique(np.asarray(blocks), return_inverse=True)[1][order]
     drawn = [
-        np.percentile(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))]), percent)
-        for _ in range(RESAMPLES)
+        _counted_percentile(sizes[order], np.bincount(row, minlength=len(names))[place], percent) for row in chosen
     ]
     return value, max(limit, float(np.percentile(drawn, 100 * CONFIDENCE)))
+
+
+def _counted_percentile(ascending: Array, counts: NDArray[np.int64], percent: float) -> float:
+    """Percentile of values (n,) that each come as often as `counts` (n,) says, as `np.percentile` gives it."""
+    behind = np.cumsum(counts)
+    rank = (behind[-1] - 1) * percent / 100
+    low, high = ascending[np.searchsorted(behind, [np.floor(rank), np.ceil(rank)], side="right")]
+    return float(low + (rank - np.floor(rank)) * (high - low))
 
 
 def _by_block(values: Array, blocks: Sequence[int]) -> tuple[Array, Array]:

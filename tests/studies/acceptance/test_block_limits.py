@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from studies.acceptance.acceptance_table import (
+    _counted_percentile,
     block_mean_limit,
     block_percentile_limit,
     block_rms_limit,
@@ -82,6 +83,14 @@ def test_the_limit_of_a_percentile_grows_with_a_bad_flight() -> None:
     assert limit > value > block_percentile_limit(alike, BLOCKS, 99.0, "alike")[1]
     # The same draws for the same key.
     assert block_percentile_limit(bad, BLOCKS, 99.0, "bad") == (value, limit)
+
+
+def test_a_percentile_of_counted_values_is_that_of_the_repeated_ones() -> None:
+    rng = np.random.default_rng(5)
+    for percent in (0.0, 12.5, 50.0, 99.0, 100.0):
+        values, counts = np.sort(rng.normal(size=30)), rng.integers(0, 4, 30)
+        want = np.percentile(np.repeat(values, counts), percent)
+        assert _counted_percentile(values, counts, percent) == pytest.approx(want, abs=1e-15)
 
 
 @pytest.mark.parametrize("count", [1, 2, 50])
