@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest import random_streams
 from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.user_cache import kept_arrays
 from geometry.compiled_loops import compiled, inlined
 
 Field = NDArray[np.float32]
@@ -57,6 +59,18 @@ def _noise_of_spectrum(seed: int, stream: str, amplitude: NDArray[np.float64]) -
     noise = np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=(size_px, size_px))
     result: Field = (noise / noise.std()).astype(np.float32)
     return result
+
+
+def kept_tile(name: str, source: str, make: Callable[[], MipTile]) -> MipTile:
+    """A texture that is the same for all scenes: from the user's cache, or made and kept there.
+
+    Args:
+        name: of its file.
+        source: file of the code that makes it, besides this one.
+        make: makes it.
+    """
+    sources = (source, __file__, str(random_streams.__file__))
+    return MipTile.from_arrays(kept_arrays(f"ground-{name}", sources, lambda: make().to_arrays()))
 
 
 class MipTile:

@@ -20,7 +20,7 @@ from scenes.ground.land_tiles import (
     land_textures,
 )
 from scenes.ground.sea import fresnel, inside_share
-from scenes.ground_view import Axes, Field, GroundView, MipTile, power_noise, smooth_noise
+from scenes.ground_view import Axes, Field, GroundView, MipTile, kept_tile, power_noise, smooth_noise
 
 _SEED = 3
 _SIZE_PX, _TEXEL_M = 1024, 60.0
@@ -91,12 +91,16 @@ def _region_fields() -> NDArray[np.float32]:
 @lru_cache(maxsize=1)
 def region_tile() -> MipTile:
     """Three fields whose signs separate regions, and one of brightness; of unit variance."""
-    return MipTile(_region_fields(), _TEXEL_M)
+    return kept_tile("regions", __file__, lambda: MipTile(_region_fields(), _TEXEL_M))
 
 
 @lru_cache(maxsize=1)
 def gradient_tile() -> MipTile:
     """Lengths of the gradients of the three fields. [1/m]"""
+    return kept_tile("region-gradients", __file__, _gradients)
+
+
+def _gradients() -> MipTile:
     fields = _region_fields()[..., :3]
     steps = [(np.roll(fields, -1, axis) - np.roll(fields, 1, axis)) / np.float32(2 * _TEXEL_M) for axis in (0, 1)]
     return MipTile(np.ascontiguousarray(np.hypot(*steps)), _TEXEL_M)
@@ -105,6 +109,10 @@ def gradient_tile() -> MipTile:
 @lru_cache(maxsize=1)
 def moved_tile() -> MipTile:
     """Displacements east and north of unit variance."""
+    return kept_tile("moved", __file__, _moved)
+
+
+def _moved() -> MipTile:
     return MipTile(np.stack([smooth_noise(_SEED, f"moved {axis}", _SIZE_PX, 34.0) for axis in "xy"], axis=-1), _TEXEL_M)
 
 

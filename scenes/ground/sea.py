@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 from drogue_models.frozen_model import ReflectanceRgb
 from geometry.bilinear_sampling import sample_bilinear
-from scenes.ground_view import Axes, Field, GroundView, MipTile, power_noise
+from scenes.ground_view import Axes, Field, GroundView, MipTile, kept_tile, power_noise
 from scenes.sky.photometry import Radiance
 
 _WATER_INDEX = 1.34
@@ -117,6 +117,10 @@ def hidden_share(sine: NDArray[np.floating[Any]], variance: float) -> NDArray[np
 @lru_cache(maxsize=1)
 def _wave_tile() -> MipTile:
     """Slopes along and across the wind (together of unit variance), and patches of foam (mean `_FOAM_PATCHES`)."""
+    return kept_tile("waves", __file__, _waves)
+
+
+def _waves() -> MipTile:
     rng = frame_generator(_SEED, 0, "waves")
     k1, k2 = np.meshgrid(
         np.fft.fftfreq(_TILE_PX, _TILE_TEXEL_M), np.fft.rfftfreq(_TILE_PX, _TILE_TEXEL_M), indexing="ij"

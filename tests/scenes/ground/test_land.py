@@ -10,7 +10,7 @@ import pytest
 
 from datasets_manifest.types.environment import CloudLayer
 from scenes.environment_radiance import EnvironmentRadiance
-from scenes.ground import land_tiles
+from scenes.ground import land_cover, land_tiles, sea
 from scenes.ground.ground_radiance import Ground
 from scenes.ground.land_painting import LandKind
 from scenes.ground.land_tiles import (
@@ -164,6 +164,23 @@ def test_kept_textures_are_those_that_were_painted() -> None:
         places = everywhere(200.0, 70, width_m)
         assert np.array_equal(kept.sample(*places), painted.sample(*places))
     assert (kept.most, *kept.mean) == (painted.most, *painted.mean)
+
+
+def test_kept_noise_is_that_which_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    textures = {
+        land_cover.region_tile: lambda: MipTile(land_cover._region_fields(), land_cover._TEXEL_M),
+        land_cover.gradient_tile: land_cover._gradients,
+        land_cover.moved_tile: land_cover._moved,
+        sea._wave_tile: sea._waves,
+    }
+    made = [make().to_arrays() for make in textures.values()]
+    for _ in range(2):
+        for kept, arrays in zip(textures, made, strict=True):
+            found = kept.__wrapped__().to_arrays()
+            assert all(np.array_equal(found[key], array) for key, array in arrays.items())
+        # Each has a file of its own, which the others do not remove.
+        assert len([*(tmp_path / "droguekit" / "arrays").iterdir()]) == len(textures)
 
 
 def test_kept_textures_know_all_code_that_they_follow_from() -> None:
