@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -157,7 +158,12 @@ def waiting_run(
         command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "quick.toml")]
         options = ["--out", str(tmp_path / "out"), "--workers", "1"]
         process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True)
-        assert (tmp_path / "begun").read_text() == "2\n"
+        # Opened without waiting for the writer, so that a run that ends early fails instead of hanging.
+        begun = os.open(tmp_path / "begun", os.O_RDONLY | os.O_NONBLOCK)
+        is_told, _, _ = select.select([begun], [], [], 120.0)
+        told = os.read(begun, 10) if is_told else b""
+        os.close(begun)
+        assert told == b"2\n"
         return process
 
     return start
