@@ -16,11 +16,8 @@ from datasets_manifest.storage.layout import EVENTS_FILE
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import RunSummary, render_dataset
-from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, between, recipe_text
+from tests.support.recipe_builder import PLAIN_SKY, RIG_160_PX, RIG_320_PX, between, recipe_text
 from tests.support.shared_folder import shared_folder
-
-# Every process that renders ground computes its texture first, for seconds; a picture of sky and ground costs nothing.
-PLAIN_SKY = {"map": {"file": str(Path(__file__).with_name("plain_sky.hdr")), "cd_m2_per_unit": 1000.0}}
 
 # For what asks where surfaces lie and not for their light.
 FEWEST_RAYS = {

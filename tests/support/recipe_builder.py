@@ -19,6 +19,9 @@ from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 
 Section = Mapping[str, Any]
 
+# Every process that renders ground computes its texture first, for seconds; a picture of sky and ground costs nothing.
+PLAIN_SKY = {"map": {"file": str(Path(__file__).with_name("plain_sky.hdr")), "cd_m2_per_unit": 1000.0}}
+
 
 class RecipeTable(TypedDict, total=False):
     """The keys of a recipe, see `datasets_manifest.recipe.recipe.Recipe` and docs/reference/recipes.md."""

@@ -13,7 +13,7 @@ from typing import Unpack
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, RecipeTable, between, recipe_text
+from tests.support.recipe_builder import PLAIN_SKY, RIG_160_PX, RIG_320_PX, RecipeTable, between, recipe_text
 
 # Single pairs between 2 and 5 m, some of them without a drogue.
 SINGLE_PAIRS: RecipeTable = {
@@ -22,6 +22,7 @@ SINGLE_PAIRS: RecipeTable = {
     "rig": RIG_160_PX,
     "frames": {"count": 4, "scenes": 2, "empty_fraction": 0.3},
     "distance": between(2.0, 5.0),
+    "environment": PLAIN_SKY,
     "render": {"engine": "analytic"},
 }
 
@@ -30,6 +31,7 @@ STATION_KEEPING: RecipeTable = {
     "name": "sequence-test",
     "seed": 2,
     "frames": {"count": 60, "scenes": 2},
+    "environment": PLAIN_SKY,
     "exposure": {"time_s": 0.002},
     "sequence": {"frames_per_sequence": 20, "receiver": {"manoeuvres": ["station"], "start_m": 4.0}},
 }
@@ -42,6 +44,7 @@ TOY: RecipeTable = {
     "rig": RIG_320_PX | {"focal_px": 300.0, "encoding": "gamma"},
     "frames": {"count": 40, "scenes": 10, "empty_fraction": 0.1},
     "distance": between(2.0, 4.0, "log-uniform"),
+    "environment": PLAIN_SKY,
     "render": {"engine": "analytic"},
     "split": {"train": 1.0, "val": 0.0, "test": 0.0},
 }
