@@ -1,0 +1,1 @@
+"""Whether a detector finds drogues of a family that it never saw."""
