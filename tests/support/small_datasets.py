@@ -31,7 +31,6 @@ STATION_KEEPING: RecipeTable = {
     "name": "sequence-test",
     "seed": 2,
     "frames": {"count": 60, "scenes": 2},
-    "environment": PLAIN_SKY,
     "exposure": {"time_s": 0.002},
     "sequence": {"frames_per_sequence": 20, "receiver": {"manoeuvres": ["station"], "start_m": 4.0}},
 }
