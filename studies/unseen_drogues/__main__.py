@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from datasets_manifest.recipe.recipe import RecipeSource
-from datasets_manifest.storage.layout import FRAMES_FOLDER, MANIFEST_FILE, RECIPE_FILE, frame_folder
+from datasets_manifest.storage.layout import FRAMES_FOLDER, RECIPE_FILE, frame_folder
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.frame import FrameSpec
 from droguekit.batch.progress import PlainProgress
@@ -47,8 +47,12 @@ def link_without(corpus: Path, family: str, out: Path) -> Path:
     kept = [index for index in source.frame_indices if family not in families_in(source.record(index).frame)]
     if not kept:
         raise ValueError(f"{corpus}: every pair shows a drogue of the family {family}")
-    if not (out / MANIFEST_FILE).is_file():
-        shutil.copytree(corpus, out, copy_function=_link_pair)
+    if not out.exists():
+        # Under another name until it is whole, so that a run that is stopped meanwhile begins it again.
+        part = out.with_name(f"{out.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.copytree(corpus, part, copy_function=_link_pair)
+        part.rename(out)
     for index in sorted(set(Dataset(out).frame_indices) - set(kept)):
         shutil.rmtree(frame_folder(out, index))
     # Every pair is there, so that this only writes the manifest.
