@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import Delaunay
+from shapely import contains_xy
 from shapely.geometry import Polygon
 
 from geometry.se3 import Array
+
+# Distance between the points inside a flat cap, over the mean length of its outlines' edges.
+_LATTICE_PER_EDGE = 2.5
+# Longest piece of a bar, over its width.
+_PIECE_PER_WIDTH = 3.0
 
 
 def area_radius_m(radius_m: float, sections: int) -> float:
@@ -67,11 +75,55 @@ def pocketed_plate(
 
 def _cap(outer_m: Array, holes_m: Sequence[Array], z_m: float, facing: int) -> trimesh.Trimesh:
     """A flat piece at one height that looks along +z or -z."""
-    points, faces = trimesh.creation.triangulate_polygon(Polygon(outer_m, holes_m), engine="earcut")
+    points, faces = _compact_triangles([outer_m, *holes_m])
     flat = trimesh.Trimesh(np.column_stack([points, np.full(len(points), z_m)]), faces, process=False)
     if np.sign(flat.face_normals[:, 2].sum()) != facing:
         flat.invert()
     return flat
+
+
+def _compact_triangles(outlines_m: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
+    """Triangles of a polygon, nearly equilateral where its outlines are round.
+
+    Triangles between far corners would be long and narrow: their boxes overlap, and a ray meets dozens of them before
+    it finds the one that it hits.
+
+    Args:
+        outlines_m: (N, 2) its outline, and that of each hole.
+
+    Returns:
+        (V, 2) corners, those of the outlines among them [m], and (F, 3) triangles.
+    """
+    polygon = Polygon(outlines_m[0], outlines_m[1:])
+    corners = np.vstack(outlines_m)
+    edges = np.vstack([_edges_around(len(outline)) for outline in outlines_m])
+    edges += np.repeat(np.cumsum([0, *map(len, outlines_m[:-1])]), [len(outline) for outline in outlines_m])[:, None]
+    step_m = _LATTICE_PER_EDGE * float(np.linalg.norm(np.diff(corners[edges], axis=1), axis=-1).mean())
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y = np.meshgrid(np.arange(low[0], high[0], step_m), np.arange(low[1], high[1], np.sqrt(3) / 2 * step_m))
+    x[1::2] += step_m / 2
+    inside = contains_xy(polygon.buffer(-step_m / 2), x, y)
+    points = np.vstack([corners, np.column_stack([x[inside], y[inside]])])
+    faces = Delaunay(points).simplices.astype(np.int64)
+    faces = faces[contains_xy(polygon, points[faces].mean(axis=1))]
+    if np.array_equal(_border_of(faces), np.unique(np.sort(edges, axis=1), axis=0)):
+        return points, faces
+    # An outline has a corner close to the middle of another's long edge.
+    points, faces = trimesh.creation.triangulate_polygon(polygon, engine="earcut")
+    return points, faces
+
+
+def _edges_around(count: int) -> NDArray[np.int64]:
+    """(count, 2) neighbours on a closed outline of so many corners."""
+    here = np.arange(count)
+    return np.column_stack([here, (here + 1) % count])
+
+
+def _border_of(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(B, 2) edges of one triangle only, each in rising order, sorted."""
+    edges, uses = np.unique(np.sort(trimesh.geometry.faces_to_edges(faces), axis=1), axis=0, return_counts=True)
+    border: NDArray[np.int64] = edges[uses == 1]
+    return border
 
 
 def _wall(outline_m: Array, height_m: float, facing: int) -> trimesh.Trimesh:
@@ -160,7 +212,10 @@ def bar(start_m: ArrayLike, end_m: ArrayLike, width_along: ArrayLike, size_m: tu
     wide = np.asarray(width_along, dtype=np.float64) * size_m[0] / 2
     thick = np.cross(along, wide / np.linalg.norm(wide)) * size_m[1] / 2
     corners = np.array([-wide - thick, wide - thick, wide + thick, -wide + thick])
-    return loft(np.stack([start + corners, end + corners]))
+    # A triangle over the length of a slanting bar has a box far larger than itself, which most rays near it meet.
+    pieces = math.ceil(float(np.linalg.norm(end - start)) / (_PIECE_PER_WIDTH * max(size_m)))
+    middle = np.linspace(start, end, pieces + 1)
+    return loft(middle[:, None] + corners)
 
 
 def with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -24,6 +24,8 @@ DIHEDRAL_SLOPE = math.tan(math.radians(5.0))
 WING_HEIGHT_M = 1.05  # of the chord line above the pod's axis, at the pod
 TRAILING_EDGE_X_M = -0.7  # of the wing, at the pod
 THICKNESS_FRACTION = 0.12
+# Triangles over many metres of a swept wing would have boxes that most rays near it meet.
+_WING_SLICES = 31
 POD_LENGTH_M, POD_RADIUS_M = 4.2, 0.40
 TUNNEL_RADIUS_M, TUNNEL_DEPTH_M = 0.16, 0.8
 
@@ -83,7 +85,7 @@ def _wing_z_m(y_m: float) -> float:
 def _wing() -> trimesh.Trimesh:
     section = _aerofoil(24)
     rings = []
-    for y_m in np.linspace(TIP_Y_M, ROOT_Y_M, 7):
+    for y_m in np.linspace(TIP_Y_M, ROOT_Y_M, _WING_SLICES):
         ring = np.empty((len(section), 3))
         ring[:, 0] = _nose_x_m(y_m) + section[:, 0] * _chord_m(y_m)
         ring[:, 1] = y_m

@@ -16,8 +16,7 @@ from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP
 from geometry.se3 import Array
 from render.compositing import Compositor
 from render.mitsuba_engine.paths.denoised_paths import LEAST_TIMES, MOST_TIMES, DenoisedPaths
-from render.mitsuba_engine.paths.rays import FrameRays, StratifiedSamples, chunks_by_count, rows_of
-from render.mitsuba_engine.paths.received_light import trace_received
+from render.mitsuba_engine.paths.rays import FrameRays, rows_of
 from render.mitsuba_engine.paths.surface_cells import SurfaceCells
 from render.mitsuba_engine.paths.surface_light import SurfaceLight
 from render.mitsuba_engine.render_noise import MOST_COUNT, NoiseBudget
@@ -131,7 +130,8 @@ class SharedLight(SurfaceLight):
             max_depth: longest path in segments.
         """
         self._counts = paths[self._part_of_row]
-        self._traced = np.concatenate([self._row_means(self._counts, max_depth) for _ in range(2)], axis=1)
+        rows = np.arange(len(self._counts))
+        self._traced = np.concatenate([self._path_means(rows, self._counts, max_depth) for _ in range(2)], axis=1)
         self._smooth_traced()
 
     def widen(self, times: float) -> None:
@@ -148,14 +148,3 @@ class SharedLight(SurfaceLight):
         """(256,) sums over the centres on each part of the light's squared error. [cd2/m4]"""
         error = np.array(self._error).reshape(-1, 4)[: self._none, :3].astype(np.float64)
         return np.bincount(self._part_of_row, weights=np.sum(error**2, axis=1), minlength=256).astype(np.float64)
-
-    def _row_means(self, counts: NDArray[np.int64], max_depth: int) -> NDArray[np.float32]:
-        """(P, 3) means over (P,) numbers of paths. [cd/m2]"""
-        found = [np.zeros((0, 3), dtype=np.float32)]
-        for row, chunk in chunks_by_count(np.arange(len(counts)), counts):
-            found.append(self._means_of(StratifiedSamples(self._rays, row, chunk), max_depth))
-        return np.concatenate(found)
-
-    def _means_of(self, samples: StratifiedSamples, max_depth: int) -> NDArray[np.float32]:
-        # What the samples take for pixels are rows of the centres.
-        return samples.means(trace_received(self._rays, self._points.at(samples.pixel), samples.place, max_depth))

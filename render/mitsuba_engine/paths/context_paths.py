@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
-from render.mitsuba_engine.paths.denoised_paths import MOST_SMOOTHING_STEPS, denoised_edge_light, denoised_light
+from render.mitsuba_engine.paths.denoised_paths import MOST_SMOOTHING_STEPS, denoised_light
 from render.mitsuba_engine.paths.drogue_paths import mean_radiance
 from render.mitsuba_engine.paths.rays import FrameRays
 from render.mitsuba_engine.paths.surface_light import SurfaceLight
@@ -80,13 +80,15 @@ def trace_context(
     chosen = np.ones(len(center), dtype=np.bool_)
     light.trace([], CONTEXT_DEPTH, (chosen, 2 ** round(np.log2(max(count * _LATTICE_STEP_PX**2 / 4, 1)))))
     light.smooth(chosen, _LATTICE_STEP_PX * MOST_SMOOTHING_STEPS)
-    found[~shiny] = denoised_light(rays, light, pixel[~shiny], 1, at_edges=True)[:, :4]
+    found[~shiny] = denoised_light(
+        rays, light, pixel[~shiny], np.ones(np.count_nonzero(~shiny), dtype=np.int64), at_edges=True
+    )[:, :4]
     contrast = _contrast(rays, pixel, found)
     times = np.where(contrast > _EVEN, 1, 0)
     times[(contrast > _SHARP) | seen.narrow[pixel]] = _TIMES_WHERE_SHARP
     times[seen.lamps[pixel]] = _TIMES_AT_LAMPS
     again = (times > 0) & ~shiny
-    found[again] = denoised_edge_light(rays, light, pixel[again], times[again] * count)[:, :4]
+    found[again] = denoised_light(rays, light, pixel[again], times[again] * count, at_edges=True)[:, :4]
     return found
 
 

@@ -20,7 +20,6 @@ from render.mitsuba_engine.paths.rays import (
     SampledLight,
     StratifiedSamples,
     chunks_by_count,
-    means_by_pixel,
     with_duplicates,
 )
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct
@@ -34,6 +33,8 @@ PATHS_BESIDE = 8
 """Paths from each centre on surfaces beside the drogue for each of two estimates: for a picture without speckles."""
 # `samples_per_px` paths are traced where the smoothing is this wide; narrower smoothing takes more.
 _SMOOTHING_AT_COUNT_PX = 2.4
+# Nothing but slow shading varies inside a part of one paint: a ray through it counts as many through a map.
+_RAYS_PER_EVEN_RAY = 4
 LIGHT_SHARE = 0.5
 """Share of the squared noise that is aimed at which the denoised light may have after it is traced again."""
 LEAST_TIMES, MOST_TIMES = 1.5, 16.0
@@ -88,7 +89,9 @@ class DenoisedPaths:
         interior = self._planned(plans, ("open", "sheltered", "deep"))
         edges = self._planned(plans, ("edges", "deep_edges"))
         light, interior_light, edge_counts = self._trace_light_of(centers, compositor, edges, interior)
-        edge_light = denoised_edge_light(self._rays, light, with_duplicates(edges), with_duplicates(edge_counts))
+        edge_light = denoised_light(
+            self._rays, light, with_duplicates(edges), with_duplicates(edge_counts), at_edges=True
+        )
         return _without_duplicates([(interior, interior_light), (edges, edge_light)])
 
     def _planned(self, plans: dict[Eye, SamplingPlan], kinds: tuple[str, ...]) -> NDArray[np.int64]:
@@ -133,7 +136,7 @@ class DenoisedPaths:
 
     def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]) -> None:
         """Trace the light of all centres; `paths` as in `_CenterLight`."""
-        of_hidden, of_open = (grid_count(count) for count in paths)
+        of_hidden, of_open = _whole_counts(paths).tolist()
         on_drogue = [(hidden & ~light.beside, of_hidden), (~hidden & ~light.beside, of_open)]
         light.trace(on_drogue, self._settings.max_depth, (light.beside, PATHS_BESIDE))
 
@@ -180,12 +183,14 @@ class DenoisedPaths:
         more = paths * np.where(budget.light_error > _LEAST_ERROR_SHARE * budget.light_error.sum(), times, 1.0)
         self._trace_light(centered.light, centered.hidden, more)
         centered.light.smooth(np.ones(len(centered.hidden), dtype=np.bool_), MOST_SMOOTHING_STEPS)
-        budget.light_error *= [grid_count(before) / grid_count(now) for before, now in zip(paths, more, strict=True)]
+        budget.light_error *= _whole_counts(paths) / _whole_counts(more)
         return True
 
     def _interior_light(self, light: SurfaceLight, interior: NDArray[np.int64]) -> NDArray[np.float32]:
-        count = self._settings.open_samples_per_px
-        return denoised_light(self._rays, light, with_duplicates(interior), count, at_edges=False)
+        most = self._settings.open_samples_per_px
+        has_map = self._rays.has_map[light.parts_at(interior)]
+        counts = np.where(has_map, most, math.ceil(most / _RAYS_PER_EVEN_RAY))
+        return denoised_light(self._rays, light, with_duplicates(interior), with_duplicates(counts), at_edges=False)
 
     def _budget(
         self,
@@ -219,32 +224,25 @@ def _without_duplicates(groups: list[tuple[NDArray[np.int64], NDArray[np.float32
 
 
 def denoised_light(
-    rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], count: int, at_edges: bool
+    rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], counts: NDArray[np.int64], at_edges: bool
 ) -> NDArray[np.float32]:
-    """Direct light of `count` rays through each pixel, with the denoised indirect light.
+    """Direct light of rays through each pixel, with the denoised indirect light.
 
     Args:
         rays: of the frame.
         light: indirect light at pixel centres.
         pixel: (P,) flat indices.
-        count: rays per pixel.
+        counts: (P,) rays through each.
         at_edges: interpolate the indirect light between centres; otherwise each pixel must be one of the light's own.
 
     Returns:
         (P, 7) radiance, coverage and error of the denoised light.
     """
-    chunks = rays.launch_chunks(pixel, count)
-    return np.concatenate([_denoised_means(rays, light, chunk, count, at_edges) for chunk in chunks])
-
-
-def denoised_edge_light(
-    rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], counts: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    """The same as `denoised_light` at edges, with (P,) counts of rays, one for each pixel."""
     found = [np.zeros((0, 7), dtype=np.float32)]
     for chunk, chunk_counts in chunks_by_count(pixel, counts):
         samples = StratifiedSamples(rays, chunk, chunk_counts)
-        found.append(_not_negative(samples.means(_channels(rays, light, samples.pixel, samples.place, samples.moment))))
+        channels = _channels(rays, light, samples.pixel, samples.place, samples.moment, at_edges)
+        found.append(_not_negative(samples.means(channels)))
     return np.concatenate(found)
 
 
@@ -256,15 +254,6 @@ def pilot_rays(rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64]) -
     rows = np.concatenate([np.stack([np.array(channel) for channel in channels], axis=-1) for channels in found])
     single: NDArray[np.float32] = rows.reshape(len(pixel), PILOT_COUNT, 7)
     return single
-
-
-def _denoised_means(
-    rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], count: int, at_edges: bool
-) -> NDArray[np.float32]:
-    if not len(pixel):
-        return np.zeros((0, 7), dtype=np.float32)
-    channels = _channels(rays, light, *_random_places(rays, pixel, count), at_edges)
-    return _not_negative(means_by_pixel(channels, count))
 
 
 def _random_places(rays: FrameRays, pixel: NDArray[np.int64], count: int) -> tuple[Any, Any, Any]:
@@ -294,9 +283,6 @@ def _not_negative(means: NDArray[np.float32]) -> NDArray[np.float32]:
     return means
 
 
-def grid_count(count: float) -> int:
-    """The nearest number of samples out of few, as each one compiles kernels of its own: squares from 4 on."""
-    if count < 4:
-        return max(int(count), 1)
-    side = math.sqrt(count)
-    return round(side) ** 2 if side < 4 else (2 * round(side / 2)) ** 2
+def _whole_counts(paths: NDArray[np.float64]) -> NDArray[np.int64]:
+    counts: NDArray[np.int64] = np.maximum(np.rint(paths), 1).astype(np.int64)
+    return counts

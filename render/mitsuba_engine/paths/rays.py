@@ -124,7 +124,11 @@ class SampledLight:
 
 
 class FrameRays:
-    """Cameras, lights and random numbers of one frame."""
+    """Cameras, lights and random numbers of one frame.
+
+    Attributes:
+        has_map: (256,) by part ids, whether a part's paint varies.
+    """
 
     def __init__(
         self, frame: FrameSpec, scene: DrogueScene, ambient: EnvironmentRadiance, open_to_sky: NDArray[np.uint8]
@@ -143,6 +147,8 @@ class FrameRays:
         self.focal_px = frame.rig.camera.fx_px
         self._cameras = [CameraRays(frame, eye) for eye in EYES]
         self._seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
+        self.has_map = np.zeros(256, dtype=np.bool_)
+        self.has_map[[surface.part_id for surface in scene.surfaces if surface.uv is not None]] = True
         to_sun, sun_lux = scene.sun
         world_from_stage = frame.world_from_left @ frame.left_from_stage_at(0.0)
         lights_others = scene.lights_others()

@@ -1,4 +1,4 @@
-"""Indirect light smoothed over each surface: the same as `trace_residual` gives, without its noise.
+"""Indirect light smoothed over each surface: the same as paths give, without their noise.
 
 The indirect light that a matt surface receives, from other surfaces and from a partly hidden sky, varies over
 centimetres; it holds no paint pattern, no edge of the image and no shadow of the sun. So it is enough to trace paths
@@ -20,9 +20,15 @@ from numpy.typing import NDArray
 
 from drogue_models.parts import Part
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.rays import FrameRays, means_by_pixel, rows_of, stratified_over_image
-from render.mitsuba_engine.paths.received_light import matt_points, sky_received, sky_seen_and_hidden
-from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct, trace_residual
+from render.mitsuba_engine.paths.rays import (
+    FrameRays,
+    StratifiedSamples,
+    chunks_by_count,
+    means_by_pixel,
+    rows_of,
+    stratified_over_image,
+)
+from render.mitsuba_engine.paths.received_light import matt_points, sky_received, sky_seen_and_hidden, trace_received
 from render.mitsuba_engine.scene import by_shape
 from render.mitsuba_engine.trace_request import DROGUE_PARTS
 
@@ -39,7 +45,6 @@ _SAME_PLANE_M = 0.005
 _SAME_PLANE_PER_REACH = 0.25
 # cos^16: half the weight at 17 degrees.
 _NORMAL_POWER = 4
-_LEAST_REFLECTANCE = 1e-4
 # Whether more light comes from the sky or is hidden changes over tens of pixels, and samples of one place cannot tell.
 _AROUND_STEPS = 5
 # Weight of neighbours on other surfaces: their light is the best estimate where no other is near.
@@ -83,7 +88,7 @@ class SurfaceLight:
         self._cells = self._columns * -(-2 * rays.size // rays.width_px // step_px)
         place = np.full(self._cells + 1, self._none, dtype=np.uint32)
         place[self._cell_of(pixel)] = np.arange(len(pixel))
-        self._place = jit_array(mi.UInt32, place)
+        self._row_of_cell, self._place = place, jit_array(mi.UInt32, place)
         surface = self._surface(jit_array(mi.UInt32, pixel))
         shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
         # Otherwise each use of them would trace the rays again.
@@ -131,8 +136,10 @@ class SurfaceLight:
             half[np.flatnonzero(mask), :3] = self._sky_means(np.flatnonzero(mask), count)
         for mask, count in chosen:
             place = np.flatnonzero(mask)
-            # Each pixel twice: the samples of one pixel are stratified, so that their halves would not be independent.
-            halves[:, place, :3] = self._trace_means(np.tile(self.pixel[place], 2), count, max_depth).reshape(2, -1, 3)
+            counts = np.full(len(place), count)
+            # The samples of one pixel are stratified, so that their halves would not be independent.
+            for half in halves:
+                half[place, :3] = self._path_means(place, counts, max_depth)
         self._keep(halves)
 
     def _keep(self, halves: NDArray[np.float32]) -> None:
@@ -149,22 +156,15 @@ class SurfaceLight:
         mean: NDArray[np.float32] = total / np.maximum(np.bincount(rows, minlength=256), 1)[:, None]
         return mean.astype(np.float32)
 
-    def _trace_means(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:
-        """(P, 3) means over paths. [cd/m2]"""
-        if not len(pixel):
-            return np.zeros((0, 3), dtype=np.float32)
-        return np.concatenate(
-            [self._path_means(chunk, count, max_depth) for chunk in self._rays.launch_chunks(pixel, count)]
-        )
-
-    def _path_means(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:
-        rays, lanes = self._rays, len(pixel) * count
-        of_pixel = dr.gather(mi.UInt32, jit_array(mi.UInt32, pixel), dr.arange(mi.UInt32, lanes) // count)
-        ray = rays.through(of_pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
-        _, hit, surface, known = trace_direct(rays.scene, rays.lights, ray)
-        rest = trace_residual(rays.scene, rays.lights, rays.sampler(lanes, count), (surface, hit, known), max_depth)
-        reflectance = surface.bsdf(ray).eval_diffuse_reflectance(surface, hit)
-        return means_by_pixel([*(rest / dr.maximum(reflectance, _LEAST_REFLECTANCE))], count)
+    def _path_means(self, row: NDArray[np.int64], counts: NDArray[np.int64], max_depth: int) -> NDArray[np.float32]:
+        """(R, 3) means over (R,) numbers of paths from each of these centres. [cd/m2]"""
+        found = [np.zeros((0, 3), dtype=np.float32)]
+        for chunk, chunk_counts in chunks_by_count(row, counts):
+            # What the samples take for pixels are rows of the centres.
+            samples = StratifiedSamples(self._rays, chunk, chunk_counts)
+            points = self._points.at(samples.pixel)
+            found.append(samples.means(trace_received(self._rays, points, samples.place, max_depth)))
+        return np.concatenate(found)
 
     def _sky_means(self, row: NDArray[np.int64], count: int) -> NDArray[np.float32]:
         """(P, 3) means over paths that end at the next surface. [cd/m2]
@@ -264,6 +264,12 @@ class SurfaceLight:
             own = sky_received(self._rays, matt_points(surface, known), numbers, lost)
             light = dr.select(lost, own, light)
         return light, error
+
+    def parts_at(self, pixel: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """(P,) ids of the parts that these centres see, 0 for pixels that are none."""
+        part_of_row = np.append(self._part_of_row, np.uint32(Part.SKY))
+        parts: NDArray[np.uint32] = part_of_row[self._row_of_cell[self._cell_of(pixel)]]
+        return parts
 
     def at_center(self, pixel: Any) -> tuple[Any, Any]:
         """Light on the surfaces at the centres of pixels, and its error. [cd/m2]"""

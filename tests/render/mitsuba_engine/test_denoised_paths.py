@@ -93,11 +93,13 @@ def test_smoothing_moves_no_marker(
     settled: tuple[Recipe, FrameSpec, StereoRadiance], smoothed: list[StereoRadiance]
 ) -> None:
     _, frame, truth = settled
-    shifts = [
-        np.linalg.norm(redness_centroid(smoothed[0].left, marker) - redness_centroid(truth.left, marker))
-        for marker in range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)
-    ]
-    # What the renderer may do to a marker on average.
+    markers = range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)
+    ours, theirs = (
+        np.mean([[redness_centroid(seen.left, marker) for marker in markers] for seen in pictures], axis=0)
+        for pictures in (smoothed, [truth])
+    )
+    shifts = np.linalg.norm(ours - theirs, axis=1)
+    # What the renderer may do to a marker on average; the noise of one picture alone makes 0.003 to 0.007.
     assert np.mean(shifts) < 0.005
 
 
