@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.compiled_loops import compiled
+from geometry.compiled_loops import compiled, inlined
 
 _Field = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ _ROUND_BELOW, _UNDERCUT = 0.3, 0.9
 _BLOB_TEXELS, _LUMP_TEXELS = 64.0, 64.0 / 6.0
 
 
-@compiled
+@inlined
 def tile_at(tile: NDArray[np.float32], u: float, v: float) -> float:
     """Value of a (512, 512) periodic tile at column u and row v, bilinear."""
     left, top = np.floor(u), np.floor(v)
@@ -42,7 +42,7 @@ def tile_at(tile: NDArray[np.float32], u: float, v: float) -> float:
     return float(upper + b * (lower - upper))
 
 
-@compiled
+@inlined
 def lump_at(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
     """Value of the periodic volume of lumps at a place in lumps, trilinear."""
     x, y, z = x * _LUMP_TEXELS, y * _LUMP_TEXELS, z * _LUMP_TEXELS
@@ -59,7 +59,7 @@ def lump_at(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
     return float(e + c * (g - e))
 
 
-@compiled
+@inlined
 def _with_lump(excess: float, amount: float, lump: float) -> float:
     """An excess with a lump on it, which is less outside than on the surface, for no lump floats alone."""
     if lump > 0.0 and excess < 0.0:
@@ -168,7 +168,7 @@ def lumps_at(
     return total_m
 
 
-@compiled
+@inlined
 def _height_m(z: float, distance_m: float, bend: float, base_m: float) -> float:
     return z * distance_m + bend * distance_m * distance_m - base_m
 
