@@ -85,8 +85,9 @@ class RenderSettings(FrozenModel):
         max_depth: longest path, counted in segments.
         denoise: whether indirect light on a matt drogue and its surroundings is smoothed over each surface (engine
             mitsuba). Paths then start from pixel centres: `samples_per_px` where the smoothing is wide, up to
-            `edge_samples_per_px` where the drogue is far away. Interiors take `open_samples_per_px` rays, edges 16 to
-            `edge_samples_per_px` on average: fewer with more interior pixels, more with higher contrast.
+            `edge_samples_per_px` where the drogue is far away. Interiors take `open_samples_per_px` rays where paint
+            varies and a fourth of them elsewhere, edges 16 to `edge_samples_per_px` on average: fewer with more
+            interior pixels, more with higher contrast.
         noise_over_sensor: target of `denoise`: the renderer's noise on the drogue over the sensor's own. Edges take no
             more rays than it needs. Indirect light takes up to 16 times the paths where its variance alone would reach
             three quarters of the target's.
