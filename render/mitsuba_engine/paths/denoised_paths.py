@@ -33,8 +33,8 @@ PATHS_BESIDE = 8
 """Paths from each centre on surfaces beside the drogue for each of two estimates: for a picture without speckles."""
 # `samples_per_px` paths are traced where the smoothing is this wide; narrower smoothing takes more.
 _SMOOTHING_AT_COUNT_PX = 2.4
-# Nothing but slow shading varies inside a part of one paint: a ray through it counts as many through a map.
-_RAYS_PER_EVEN_RAY = 4
+# Nothing but slow shading varies inside a part of one paint: one ray there does for so many through a map.
+_RAYS_FOR_ONE_EVEN = 4
 LIGHT_SHARE = 0.5
 """Share of the squared noise that is aimed at which the denoised light may have after it is traced again."""
 LEAST_TIMES, MOST_TIMES = 1.5, 16.0
@@ -189,7 +189,7 @@ class DenoisedPaths:
     def _interior_light(self, light: SurfaceLight, interior: NDArray[np.int64]) -> NDArray[np.float32]:
         most = self._settings.open_samples_per_px
         has_map = self._rays.has_map[light.parts_at(interior)]
-        counts = np.where(has_map, most, math.ceil(most / _RAYS_PER_EVEN_RAY))
+        counts = np.where(has_map, most, math.ceil(most / _RAYS_FOR_ONE_EVEN))
         return denoised_light(self._rays, light, with_duplicates(interior), with_duplicates(counts), at_edges=False)
 
     def _budget(
