@@ -17,9 +17,12 @@ from math import cos, pi
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
@@ -60,8 +63,10 @@ _MOSAIC_RANGES = ViewRanges(scale=(0.4, 1.4), rotation_deg=4, flip_fraction=0.5)
 _SINGLE_RANGES = ViewRanges(scale=(0.65, 1.5), rotation_deg=4, flip_fraction=0.5)
 _AHEAD_BATCHES = 2
 _STEPS_PER_CURVE_POINT = 10
-# Validation every third epoch before the last input size; the best weights are chosen among those at that size.
+# Validation every third epoch before the last input size; the best weights are chosen among those at that size. In a
+# training of many epochs, validation of each would take longer than the training.
 _EPOCHS_PER_VALIDATION = 3
+_MOST_VALIDATIONS = 40
 
 
 class Member(NamedTuple):
@@ -115,9 +120,26 @@ class BatchMaker:
                 boxes.append(own)
         return Batch(np.stack(images), tuple(boxes))
 
-    def batches(self, steps: range, threads: int) -> Generator[Batch]:
-        """The batches of steps in their order; threads make them ahead."""
-        return prefetch_map(self.batch, steps, threads, threads + _AHEAD_BATCHES)
+    def batches(self, steps: range, workers: int) -> Generator[Batch]:
+        """The batches of steps in their order, made ahead by a thread, or by so many processes if more than one."""
+        if workers == 1:
+            return prefetch_map(self.batch, steps, 1, 1 + _AHEAD_BATCHES)
+        return self._batches_of_processes(steps, workers)
+
+    def _batches_of_processes(self, steps: range, workers: int) -> Generator[Batch]:
+        loader = DataLoader(
+            _BatchesByStep(self, steps),
+            batch_size=None,
+            collate_fn=lambda batch: batch,
+            num_workers=workers,
+            prefetch_factor=_AHEAD_BATCHES,
+            # A forked process shares the images that are mapped into memory.
+            multiprocessing_context="fork",
+            # OpenCV's own threads do not survive a fork.
+            worker_init_fn=lambda _: cv2.setNumThreads(0),
+        )
+        for images, boxes in loader:
+            yield Batch(images.numpy(), boxes)
 
     def _sample(self, step: int, epoch: int, position: int) -> Iterator[tuple[Image, Boxes]]:
         """Augmented images and boxes of a sample, one eye or both."""
@@ -216,6 +238,20 @@ class BatchMaker:
         return color_jitter(rng, canvas), boxes
 
 
+class _BatchesByStep(Dataset[tuple[Tensor, tuple[Boxes, ...]]]):
+    """The batches of a range of steps; images are tensors, which pass between processes without a copy."""
+
+    def __init__(self, maker: BatchMaker, steps: range) -> None:
+        self._maker, self._steps = maker, steps
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, tuple[Boxes, ...]]:
+        batch = self._maker.batch(self._steps[index])
+        return torch.from_numpy(batch.images), batch.boxes
+
+
 def learning_rate(settings: TrainingSettings, step: int) -> float:
     """The learning rate of a step, counted from 0: a linear warm-up, then half a cosine."""
     warmup = round(settings.warmup_fraction * settings.steps)
@@ -262,7 +298,7 @@ class Trainer:
     def _run(self, state: TrainingState) -> None:
         settings, maker = self.settings, BatchMaker(self.corpus, self.settings)
         curves = TensorBoardCurves(self.out, state.step * settings.batch_images)
-        batches = maker.batches(range(state.step, settings.steps), settings.loader_threads)
+        batches = maker.batches(range(state.step, settings.steps), settings.loader_workers)
         saved_s = began_s = time.monotonic()
         with closing(curves), closing(batches):
             for batch in batches:
@@ -321,7 +357,8 @@ class Trainer:
         began_s = time.monotonic()
         stage = int(settings.final_size_px is not None and size == settings.final_size_px)
         is_before_final_size = settings.final_size_px is not None and stage == 0 and state.step < settings.steps
-        validation = None if is_before_final_size and epoch % _EPOCHS_PER_VALIDATION else self._validate(state, size)
+        is_due = not (is_before_final_size and epoch % _EPOCHS_PER_VALIDATION) and self._is_long_ago(state)
+        validation = self._validate(state, size) if is_due or state.step == settings.steps else None
         row = self._row(state, epoch, validation)
         state.rows.append(row)
         if validation is not None and (stage, validation.ap) > state.best:
@@ -333,6 +370,12 @@ class Trainer:
         self._save(state)
         left_s = (settings.steps - state.step) * per_step_s
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
+
+    def _is_long_ago(self, state: TrainingState) -> bool:
+        """Whether a fortieth of the training has passed since the last validation."""
+        passes = [row.image_passes for row in state.rows if row.ap is not None]
+        last_step = passes[-1] // self.settings.batch_images if passes else 0
+        return state.step - last_step >= self.settings.steps / _MOST_VALIDATIONS
 
     def _validate(self, state: TrainingState, size: SizePx) -> ValidationScores | None:
         network = state.average.network

@@ -105,7 +105,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out), limit_threads(settings.threads):
         remove_partial_files(out)
-        size, threads = settings.largest_size_px, settings.loader_threads
+        size, threads = settings.largest_size_px, settings.loader_workers
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop, photographs)
         state = new_state(starting_network(settings, start), settings, compute)
         is_resumed = restore_state(out, state, settings, corpus.datasets)

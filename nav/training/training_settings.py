@@ -18,7 +18,7 @@ SizePx = tuple[int, int]
 
 # They may differ when a training is resumed: they change its device or speed, the last bits of floats, or the exported
 # file's metadata, but not what is trained.
-_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes", "large_from_px", "licence")
+_FREE_TO_CHANGE = ("device", "threads", "loader_workers", "checkpoint_minutes", "large_from_px", "licence")
 
 
 class TrainingSettings(FrozenModel):
@@ -53,7 +53,7 @@ class TrainingSettings(FrozenModel):
         precision: `bf16` computes most operations in bfloat16; `auto` does so where the hardware supports it.
         device: `cpu` or `cuda`.
         threads: number of computing threads; 0 for all cores.
-        loader_threads: number of threads that prepare images.
+        loader_workers: number of workers that prepare images: 1 is a thread of the training, more are processes.
         checkpoint_minutes: longest time between two checkpoints; the end of every epoch is one too. [min]
         large_from_px: the exported detector takes boxes whose longer side in the input is at least this from a second
             pass at half the size; 0 for a single pass. [px]
@@ -93,7 +93,7 @@ class TrainingSettings(FrozenModel):
     precision: Literal["auto", "float32", "bf16"] = "auto"
     device: Literal["cpu", "cuda"] = "cpu"
     threads: int = Field(default=0, ge=0, le=1024)
-    loader_threads: int = Field(default=1, ge=1, le=64)
+    loader_workers: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
     large_from_px: float = Field(default=160.0, ge=0, le=MAX_SIDE_PX)
     start_sha256: str = Field(default="", pattern="^([0-9a-f]{64})?$", exclude_if=lambda digest: not digest)

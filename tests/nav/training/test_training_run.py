@@ -115,8 +115,8 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
         other = settings.model_copy(update=changes)
         with pytest.raises(ValueError, match=rf"checkpoint\.pt: belongs to a training that differs in {keys};"):
             train([split_dataset], tmp_path, other, PlainProgress(told))
-    # Where and with how many threads it computes may change.
-    elsewhere = settings.model_copy(update={"loader_threads": 2, "checkpoint_minutes": 1.0, "licence": "MIT"})
+    # Where and with how many workers it computes may change.
+    elsewhere = settings.model_copy(update={"loader_workers": 2, "checkpoint_minutes": 1.0, "licence": "MIT"})
     train([split_dataset], tmp_path, elsewhere, PlainProgress(told))
     assert len(step_losses(tmp_path)) == settings.steps
 

@@ -16,7 +16,7 @@ from nav.training.training_settings import build_settings, parse_size
         ({"final_size_px": (480, 320_000)}, "final_size_px: must be at most 4096 px a side"),
         ({"batch_images": 5}, "batch_images: must be even"),
         ({"batch_images": 2048}, "batch_images:"),
-        ({"loader_threads": 65}, "loader_threads:"),
+        ({"loader_workers": 65}, "loader_workers:"),
         ({"variant": "m"}, "variant:"),
         ({"learning_rate": float("nan")}, "learning_rate:"),
         ({"image_passes": 0}, "image_passes:"),
