@@ -66,7 +66,7 @@ _STEPS_PER_CURVE_POINT = 10
 # Validation every third epoch before the last input size; the best weights are chosen among those at that size. In a
 # training of many epochs, validation of each would take longer than the training.
 _EPOCHS_PER_VALIDATION = 3
-_MOST_VALIDATIONS = 40
+_MOST_VALIDATIONS = 20
 
 
 class Member(NamedTuple):
@@ -372,7 +372,7 @@ class Trainer:
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
 
     def _is_long_ago(self, state: TrainingState) -> bool:
-        """Whether a fortieth of the training has passed since the last validation."""
+        """Whether a twentieth of the training has passed since the last validation."""
         passes = [row.image_passes for row in state.rows if row.ap is not None]
         last_step = passes[-1] // self.settings.batch_images if passes else 0
         return state.step - last_step >= self.settings.steps / _MOST_VALIDATIONS
