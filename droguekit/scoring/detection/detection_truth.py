@@ -1,7 +1,8 @@
 """The boxes that a detector should find in every image of a dataset.
 
 The box to be found goes around the drogue's visible pixels. A drogue of which too little is seen is *ignored*: neither
-finding nor missing it counts. `scored_boxes` leaves out the boxes on such a drogue.
+finding nor missing it counts; and so is one beside the sought drogue that looks very small. `scored_boxes` leaves out
+the boxes on such a drogue.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from geometry.stereo import EYES, Eye
 
 # A box of which at least this share lies in an ignored drogue's box belongs to it: COCO's rule for crowds at IoU 0.5.
 _LEAST_SHARE_INSIDE = 0.5
+# Longer side of another tanker's drogue over the image's height. The seed paper's camera sees 0.036 of it at 40 m, the
+# farthest that a drogue is sought.
+_LEAST_OTHER_SIDE_FRACTION = 0.025
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,8 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
     others, ignored_others = [], []
     for other in view.neighbours:
         full, visible = other.box_full_xywh_px, other.box_visible_xywh_px
-        if visible is not None and visible[2] * visible[3] >= LEAST_SEEN_FRACTION * full[2] * full[3]:
+        is_seen = visible is not None and visible[2] * visible[3] >= LEAST_SEEN_FRACTION * full[2] * full[3]
+        if visible is not None and is_seen and max(full[2:]) >= _LEAST_OTHER_SIDE_FRACTION * size_px[1]:
             others.append(corner_box(visible))
         elif (clipped := clipped_box(corner_box(full), size_px)) is not None:
             ignored_others.append(clipped)

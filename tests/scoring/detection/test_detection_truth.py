@@ -14,7 +14,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from datasets_manifest.storage.storage import open_storage
-from datasets_manifest.types.records import PairRecord, ViewRecord
+from datasets_manifest.types.records import NeighbourView, PairRecord, ViewRecord
 from droguekit.scoring.detection.detection_truth import image_truth, read_detection_truth
 from droguekit.scoring.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
 from droguekit.scoring.results.detection_result import (
@@ -98,6 +98,18 @@ def test_an_ignored_drogue_is_known_by_its_full_box_inside_the_image(build: Simp
     hidden = record.views.left.model_copy(update={"box_visible_xywh_px": None, "box_full_xywh_px": (-50, 900, 80, 90)})
     truth = image_truth(with_left(record, hidden), "left", "test", SIZE_PX)
     assert (truth.box_xywh, truth.ignored_xywh) == (None, (0.0, 900.5, 30.5, 59.5))
+
+
+@pytest.mark.parametrize(("side_px", "counts"), [(24.1, True), (23.9, False)])
+def test_a_drogue_beside_the_sought_one_counts_from_a_fortieth_of_the_height(
+    build: SimpleNamespace, side_px: float, counts: bool
+) -> None:
+    record = build.record(0, build.pose(0.1, 0.0, 10.0))
+    box = (100.0, 100.0, 0.8 * side_px, side_px)
+    other = NeighbourView(box_full_xywh_px=box, box_visible_xywh_px=box, visible_drogue_px=300, truncated=False)
+    view = record.views.left.model_copy(update={"neighbours": (other,)})
+    truth = image_truth(with_left(record, view), "left", "test", SIZE_PX)
+    assert (len(truth.others_xywh), len(truth.ignored_others_xywh)) == (counts, not counts)
 
 
 def test_a_pair_without_a_drogue_has_nothing_to_be_found(build: SimpleNamespace) -> None:
