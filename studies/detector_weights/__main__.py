@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
-import onnx
 import typer
 
-from datasets_manifest.atomic import write_bytes_atomic
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import progress_report
 from droguekit.batch.render_dataset import render_dataset
-from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.detector.detector_registry import network_file
+from nav.training.training_run import ONNX_FILE
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
 from studies.world_variety.detection_by_drogue import score_by_drogue
@@ -26,82 +23,42 @@ from studies.world_variety.detection_by_drogue import score_by_drogue
 _HERE = Path(__file__).parent
 # Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
 CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
-# Set by hand for the weights before, and kept: validation gives 0.434 for `l` and 0.507 for `s`.
-THRESHOLD = 0.48
+# Of `train.toml`, as many as its rendering had made when the training began.
+MORE_FRAMES = range(1400)
+# Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
+EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
 
 
-class Start(NamedTuple):
-    """Weights that a training begins with, as the repository had them.
-
-    Attributes:
-        commit: that has them.
-        sha256: of the file.
-    """
-
-    commit: str
-    sha256: str
-
-
-STARTS = {
-    "l": Start("ab1d575", "00f365af11fb3b2fe8e8d3a029ea145c80bd526e8d3e6a9894d7bc46c92788bb"),
-    "s": Start("ab1d575", "32cb1b2b50d1f564111971ee942688f6d59fae02978811bc754eac004f183f7a"),
-}
-
-
-def write_start(variant: str, path: Path) -> None:
-    """Write the weights that the training of a variant begins with, from the history of this repository.
-
-    Raises:
-        OSError: the history lacks them, or they are others.
-    """
-    start = STARTS[variant]
-    name = f"{start.commit}:nav/detector/weights/mobile-{variant}.onnx"
-    ended = subprocess.run(["git", "show", name], cwd=_HERE, capture_output=True, check=False)
-    if ended.returncode != 0:
-        raise OSError(f"git has no {name}: run this in a clone with its whole history (git fetch --unshallow)")
-    if hashlib.sha256(ended.stdout).hexdigest() != start.sha256:
-        raise OSError(f"{name}: is not the file with sha256 {start.sha256}")
-    write_bytes_atomic(path, ended.stdout)
-
-
-def set_threshold(trained: Path, threshold: float, path: Path) -> None:
-    """Copy a network file with another score threshold."""
-    model = onnx.load(trained)
-    properties = {entry.key: entry.value for entry in model.metadata_props}
-    metadata = replace(ModelMetadata.from_json(properties[METADATA_KEY]), score_threshold=threshold)
-    onnx.helper.set_model_props(model, properties | {METADATA_KEY: metadata.to_json()})
-    write_bytes_atomic(path, model.SerializeToString(deterministic=True))
-
-
-def make_weights(variant: str, out: Path, workers: int) -> Path:
-    """Fetch photographs, render the corpus and the test set, and train; what is there is not made again.
+def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
+    """Fetch photographs, render both corpora and the test sets, and train; what is there is not made again.
 
     Returns:
-        The file that ships: the last weights of the training, with `THRESHOLD`.
+        The file that ships.
     """
-    log = out / "log.txt"
     say = typer.echo
     say(f"photographs of {', '.join(TRAINING_PACKAGES + TEST_PACKAGES)}")
     fetch_photographs(out / "photographs", TRAINING_PACKAGES)
     fetch_photographs(out / "test-photographs", TEST_PACKAGES)
     say(f"{len(CORPUS_FRAMES)} pairs of detector-train")
     render_dataset(load_recipe("detector-train"), out / "corpus", CORPUS_FRAMES, workers, progress_report())
+    say(f"{len(MORE_FRAMES)} pairs of more scenes")
+    render_dataset(load_recipe(str(_HERE / "train.toml")), out / "more", MORE_FRAMES, workers, progress_report())
     test = load_recipe(str(_HERE / "test.toml"))
     say(f"{test.recipe.frames.count} pairs of the test set")
     render_dataset(test, out / "test", range(test.recipe.frames.count), workers, progress_report())
-    write_start(variant, out / f"start-{variant}.onnx")
-    folder = out / variant
+    without = load_recipe(str(_HERE / "test.toml"), changes=EMPTY)
+    say(f"{without.recipe.frames.count} pairs without a drogue")
+    render_dataset(without, out / "empty", range(without.recipe.frames.count), workers, progress_report())
+    log, folder = out / "log.txt", out / variant
     say(f"training; {log} tells how far it is")
-    words = ["--settings", _HERE / f"{variant}.toml", "--start-from", out / f"start-{variant}.onnx"]
+    words = ["--settings", _HERE / f"{variant}.toml", "--device", device]
     words += ["--photographs", out / "photographs", "--cache", out / "cache"]
-    run_droguekit("train", out / "corpus", "--out", folder, *words, log=log)
-    shipped = out / f"mobile-{variant}.onnx"
-    set_threshold(folder / "last.onnx", THRESHOLD, shipped)
-    return shipped
+    run_droguekit("train", out / "corpus", out / "more", "--out", folder, *words, log=log)
+    return folder / ONNX_FILE
 
 
 def score_lines(out: Path, detectors: dict[str, Path]) -> Iterator[str]:
-    """A Markdown table of scores on the test set by drogue, and how many photographs without a drogue have a box."""
+    """A Markdown table of scores on the test set by drogue, and how many pictures without a drogue have a box."""
     scores = {name: list(score_by_drogue(out / "test", str(path))) for name, path in detectors.items()}
     heads = "".join(f" {name}: AP50, recall | false boxes |" for name in detectors)
     yield f"| drogue | images | drogues |{heads}"
@@ -110,6 +67,8 @@ def score_lines(out: Path, detectors: dict[str, Path]) -> Iterator[str]:
         cells = "".join(f" {_percent(row.ap50)}, {_percent(row.recall)} | {row.false_boxes} |" for row in rows)
         yield f"| {rows[0].kind} | {rows[0].images} | {rows[0].drogues} |{cells}"
     for name, path in detectors.items():
+        last = list(score_by_drogue(out / "empty", str(path)))[-1]
+        yield f"{name}: {last.false_boxes} boxes in {last.images} images of frames without a drogue"
         boxes = out / f"photographs-{name}.json"
         words = ["--detector", path, "--mono", "--out", boxes]
         run_droguekit("detect", out / "test-photographs", *words, log=out / "log.txt")
@@ -124,6 +83,7 @@ def _percent(share: float | None) -> str:
 
 def main(
     variant: Annotated[Literal["l", "s"], typer.Option("--variant", help="Of the network.")] = "l",
+    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="That trains.")] = "cuda",
     out: Annotated[Path, typer.Option("--out", help="Folder; a stopped run resumes in it.")] = Path(
         "out/detector-weights"
     ),
@@ -131,11 +91,13 @@ def main(
 ) -> None:
     """Make weights of a detector and print hashes and scores."""
     try:
-        new = make_weights(variant, out, workers)
-        for name in ("corpus", "test"):
+        new = make_weights(variant, out, workers, device)
+        for name in ("corpus", "more", "test", "empty"):
             typer.echo(f"{name}: {Dataset(out / name).manifest.dataset_sha256}")
         typer.echo(f"{new}: {hashlib.sha256(new.read_bytes()).hexdigest()}")
-        for line in score_lines(out, {"former": out / f"start-{variant}.onnx", "new": new}):
+        shipped = network_file(f"mobile-{variant}")
+        assert shipped is not None
+        for line in score_lines(out, {"shipped": shipped, "new": new}):
             typer.echo(line)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)

@@ -65,7 +65,7 @@ def test_detector_small_has_empty_frames_and_things_that_are_no_drogue() -> None
     # 1200 draws at 12.5 %: a standard deviation of 1 %.
     assert abs(plan.empty_fraction - 0.125) < 0.03
     empty = np.flatnonzero(np.isnan(plan.drawn.distances_m))
-    bystanders = [sample_frame(recipe, int(k)).bystanders for k in empty[:60]]
+    bystanders = [sample_frame(recipe, int(k)).bystanders for k in empty[:30]]
     negatives = sum(any(found.kind == "distractor" for found in frame) for frame in bystanders)
-    # 60 draws at 40 %: a standard deviation of 3.8.
-    assert 12 <= negatives <= 36
+    # 30 draws at 40 %: a standard deviation of 2.7.
+    assert 3 <= negatives <= 21
