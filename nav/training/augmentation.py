@@ -281,8 +281,8 @@ def _processed(rng: np.random.Generator, image: Image) -> Image:
     if rng.random() < _COMPRESSED_FRACTION:
         quality = int(rng.integers(_JPEG_QUALITY[0], _JPEG_QUALITY[1] + 1))
         # OpenCV takes blue for the first channel, and codes blue more coarsely than red.
-        _, coded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-        image = np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
+        _, coded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        image = np.asarray(cv2.cvtColor(cv2.imdecode(coded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
     return image
 
 
