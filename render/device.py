@@ -35,6 +35,18 @@ def query_gpu(quantity: str) -> float | None:
     Args:
         quantity: its name for `nvidia-smi --query-gpu`, such as `memory.free` [MiB] or `power.draw` [W].
     """
+    try:
+        return float(_told_of_gpu(quantity) or "")
+    except ValueError:
+        return None
+
+
+def gpu_model() -> str | None:
+    """Model of the GPU that engines use, such as `NVIDIA H100 80GB HBM3`; None where nvidia-smi does not tell it."""
+    return _told_of_gpu("name")
+
+
+def _told_of_gpu(quantity: str) -> str | None:
     command = ["nvidia-smi", f"--query-gpu={quantity}", "--format=csv,noheader,nounits"]
     # Engines take the first of these, or the first GPU of all.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0].strip()
@@ -42,6 +54,6 @@ def query_gpu(quantity: str) -> float | None:
         told = subprocess.run(
             [*command, "-i", visible or "0"], capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S, check=True
         )
-        return float(told.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
         return None
+    return told.stdout.strip()

@@ -17,7 +17,7 @@ from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.user_cache import user_cache_folder
 from drogue_models.untrusted_files import read_text
 from droguekit.batch.frame_cost import ProbeResult
-from render.device import Device
+from render.device import Device, gpu_model
 from render.version import RENDER_VERSION
 
 _MOST_BYTES = 1_000_000
@@ -70,6 +70,8 @@ def remember_probe(recipe: Recipe, device: Device, result: ProbeResult) -> None:
 def _file(recipe: Recipe, device: Device) -> Path:
     table = recipe.model_dump(mode="json")
     del table["split"], table["frames"]["count"]
-    basis = [table, device, RENDER_VERSION, software_versions(), cpu_features()]
+    basis: list[object] = [table, device, RENDER_VERSION, software_versions(), cpu_features()]
+    if device == "cuda":
+        basis.append(gpu_model())
     digest = hashlib.sha256(canonical_json(basis).encode()).hexdigest()[:24]
     return user_cache_folder() / "probes" / f"{digest}.json"

@@ -320,6 +320,13 @@ def test_a_recipe_that_was_planned_before_is_not_probed_again(
     found = remembered_probe(recipe, "cpu")
     assert found is not None and found.result == result
     assert remembered_probe(recipe, "cuda") is None
+    # What one GPU took tells nothing of another.
+    model = "NVIDIA H100"
+    monkeypatch.setattr("droguekit.batch.remembered_probes.gpu_model", lambda: model)
+    remember_probe(recipe, "cuda", result)
+    assert remembered_probe(recipe, "cuda") is not None
+    model = "NVIDIA L4"
+    assert remembered_probe(recipe, "cuda") is None
     assert remembered_probe(recipe.model_copy(update={"seed": recipe.seed + 1}), "cpu") is None
 
     # Of another number of pairs, whose drawn frames are others, the same measurements tell as well.

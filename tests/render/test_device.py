@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from droguekit.batch.execution import default_workers
-from render.device import query_gpu
+from render.device import gpu_model, query_gpu
 from render.engine import EngineUnavailableError, load_engine
 
 
@@ -39,6 +39,13 @@ def test_nothing_is_known_where_the_tool_tells_no_number(tool: Path, script: str
     else:
         tool.write_text(f"#!/bin/sh\n{script}\n")
     assert query_gpu("power.draw") is None
+
+
+def test_a_gpu_is_known_by_its_model(tool: Path) -> None:
+    tool.write_text("#!/bin/sh\necho 'NVIDIA H100 80GB HBM3'\n")
+    assert gpu_model() == "NVIDIA H100 80GB HBM3"
+    tool.unlink()
+    assert gpu_model() is None
 
 
 def test_a_gpu_holds_as_many_workers_as_its_memory(tool: Path, monkeypatch: pytest.MonkeyPatch) -> None:
