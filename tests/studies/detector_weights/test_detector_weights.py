@@ -9,7 +9,16 @@ import numpy as np
 
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from nav.detector.detector_registry import network_file
-from studies.detector_weights.__main__ import score_lines
+from scenes.sampler import scene_of_frame
+from studies.detector_weights.__main__ import MORE_SCENES, frames_of_first_scenes, score_lines
+
+
+def test_the_second_corpus_has_whole_scenes() -> None:
+    recipe = load_recipe(str(Path(__file__).parents[3] / "studies" / "detector_weights" / "train.toml"))
+    frames = frames_of_first_scenes(recipe, MORE_SCENES)
+    scenes = [scene_of_frame(recipe, index) for index in frames]
+    assert len(set(scenes)) == MORE_SCENES
+    assert {scenes.count(scene) for scene in scenes} == {recipe.frames.count // recipe.frames.scenes}
 
 
 def test_detectors_stand_side_by_side(tmp_path: Path) -> None:
