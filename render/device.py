@@ -56,4 +56,4 @@ def _told_of_gpu(quantity: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError, ValueError):
         return None
-    return told.stdout.strip()
+    return told.stdout.strip() or None
