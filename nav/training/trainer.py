@@ -67,6 +67,7 @@ _STEPS_PER_CURVE_POINT = 10
 # training of many epochs, validation of each would take longer than the training.
 _EPOCHS_PER_VALIDATION = 3
 _MOST_VALIDATIONS = 20
+_WORKER_ENDED = "DataLoader worker"  # in what torch says then
 
 
 class Member(NamedTuple):
@@ -262,6 +263,23 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
     return settings.learning_rate * (floor + (1 - floor) * (1 + cos(pi * done)) / 2)
 
 
+def is_validation_due(settings: TrainingSettings, steps_done: int, epoch: int, last_steps_done: int) -> bool:
+    """Whether the end of an epoch is followed by a validation: the last one is always.
+
+    Args:
+        settings: of the training.
+        steps_done: number of steps so far.
+        epoch: number of epochs so far.
+        last_steps_done: number of steps before the last validation; 0 if there was none.
+    """
+    if steps_done >= settings.steps:
+        return True
+    if steps_done - last_steps_done < settings.steps / _MOST_VALIDATIONS:
+        return False
+    is_last_size = settings.final_size_px is None or settings.size_at(steps_done - 1) == settings.final_size_px
+    return is_last_size or epoch % _EPOCHS_PER_VALIDATION == 0
+
+
 @dataclass(frozen=True, eq=False)
 class Trainer:
     """Runs a training in its folder.
@@ -286,12 +304,20 @@ class Trainer:
 
         Raises:
             ValueError: the loss is no longer finite.
-            OSError: a file cannot be written; the previous checkpoint stays.
+            OSError: a file cannot be written, or a process that prepares images ended; the previous checkpoint stays.
             KeyboardInterrupt: `should_stop` returned true; the state is saved.
         """
         self.observer.begin(f"steps of {self.settings.batch_images} images", self.settings.steps - state.step)
         try:
             self._run(state)
+        except RuntimeError as error:
+            # Raised wherever the training is when the process ends.
+            if _WORKER_ENDED not in str(error):
+                raise
+            raise OSError(
+                "loader_workers: a process that prepares images was ended, perhaps for lack of memory; run the same "
+                f"command again, with fewer than {self.settings.loader_workers}"
+            ) from error
         finally:
             self.observer.end()
 
@@ -356,9 +382,9 @@ class Trainer:
         settings, size = self.settings, self.settings.size_at(state.step - 1)
         began_s = time.monotonic()
         stage = int(settings.final_size_px is not None and size == settings.final_size_px)
-        is_before_final_size = settings.final_size_px is not None and stage == 0 and state.step < settings.steps
-        is_due = not (is_before_final_size and epoch % _EPOCHS_PER_VALIDATION) and self._is_long_ago(state)
-        validation = self._validate(state, size) if is_due or state.step == settings.steps else None
+        validated = [row.image_passes // settings.batch_images for row in state.rows if row.ap is not None]
+        is_due = is_validation_due(settings, state.step, epoch, validated[-1] if validated else 0)
+        validation = self._validate(state, size) if is_due else None
         row = self._row(state, epoch, validation)
         state.rows.append(row)
         if validation is not None and (stage, validation.ap) > state.best:
@@ -370,12 +396,6 @@ class Trainer:
         self._save(state)
         left_s = (settings.steps - state.step) * per_step_s
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
-
-    def _is_long_ago(self, state: TrainingState) -> bool:
-        """Whether a twentieth of the training has passed since the last validation."""
-        passes = [row.image_passes for row in state.rows if row.ap is not None]
-        last_step = passes[-1] // self.settings.batch_images if passes else 0
-        return state.step - last_step >= self.settings.steps / _MOST_VALIDATIONS
 
     def _validate(self, state: TrainingState, size: SizePx) -> ValidationScores | None:
         network = state.average.network

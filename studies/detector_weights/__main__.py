@@ -24,7 +24,7 @@ from studies.world_variety.detection_by_drogue import score_by_drogue
 _HERE = Path(__file__).parent
 # Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
 CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
-# Of `train.toml`: as many as its rendering had completed when the training began.
+# Of `more-scenes.toml`: as many as its rendering had completed when the training began.
 MORE_SCENES = 217
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
 EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
@@ -48,7 +48,7 @@ def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
     fetch_photographs(out / "test-photographs", TEST_PACKAGES)
     say(f"{len(CORPUS_FRAMES)} pairs of detector-train")
     render_dataset(load_recipe("detector-train"), out / "corpus", CORPUS_FRAMES, workers, progress_report())
-    more = load_recipe(str(_HERE / "train.toml"))
+    more = load_recipe(str(_HERE / "more-scenes.toml"))
     frames = frames_of_first_scenes(more.recipe, MORE_SCENES)
     say(f"{len(frames)} pairs of {MORE_SCENES} more scenes")
     render_dataset(more, out / "more", frames, workers, progress_report())

@@ -18,7 +18,7 @@ NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs/reference/detectors.md"
 # Those that do not ship with the package.
-RECIPES = {"detector-weights": str(ROOT / "studies/detector_weights/train.toml")}
+RECIPES = {"detector-weights": str(ROOT / "studies/detector_weights/more-scenes.toml")}
 
 
 def shipped(name: str) -> OnnxDetector:

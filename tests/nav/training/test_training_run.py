@@ -5,6 +5,8 @@ import fcntl
 import hashlib
 import io
 import json
+import multiprocessing
+import os
 import signal
 import subprocess
 import sys
@@ -22,6 +24,7 @@ from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
 from nav.training.evaluation import average_precision, measure_batch_statistics, predict, to_tensor, whole_image
+from nav.training.trainer import is_validation_due
 from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import (
@@ -119,6 +122,36 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
     elsewhere = settings.model_copy(update={"loader_workers": 2, "checkpoint_minutes": 1.0, "licence": "MIT"})
     train([split_dataset], tmp_path, elsewhere, PlainProgress(told))
     assert len(step_losses(tmp_path)) == settings.steps
+
+
+@pytest.mark.parametrize("final_size_px", [None, (480, 640)])
+def test_a_long_training_is_validated_twenty_times_at_most(final_size_px: tuple[int, int] | None) -> None:
+    changes = {"size_px": (320, 416), "final_size_px": final_size_px, "image_passes": 8 * 1000}
+    settings = build_settings(None, changes)
+    last, found = 0, []
+    for epoch in range(1, 501):
+        if is_validation_due(settings, 2 * epoch, epoch, last):
+            last = 2 * epoch
+            found.append(last)
+    assert 10 <= len(found) <= 20 and found[-1] == 1000
+    # Of a short one every epoch, before the final size every third.
+    short = build_settings(None, changes | {"image_passes": 8 * 12})
+    due = [epoch for epoch in range(1, 7) if is_validation_due(short, 2 * epoch, epoch, 2 * epoch - 2)]
+    assert due == ([1, 2, 3, 4, 5, 6] if final_size_px is None else [3, 4, 5, 6])
+
+
+def test_a_process_that_is_killed_ends_the_training_in_one_line(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, "image_passes": 4000, "loader_workers": 2})
+
+    def kill_one() -> bool:
+        for child in multiprocessing.active_children():
+            assert child.pid is not None
+            os.kill(child.pid, signal.SIGKILL)
+            break
+        return False
+
+    with pytest.raises(OSError, match=r"^loader_workers: a process that prepares images was ended.*fewer than 2$"):
+        train([split_dataset], tmp_path, settings, PlainProgress(io.StringIO()), should_stop=kill_one)
 
 
 class Calls:

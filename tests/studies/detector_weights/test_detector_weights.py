@@ -14,7 +14,7 @@ from studies.detector_weights.__main__ import MORE_SCENES, frames_of_first_scene
 
 
 def test_the_second_corpus_has_whole_scenes() -> None:
-    recipe = load_recipe(str(Path(__file__).parents[3] / "studies" / "detector_weights" / "train.toml"))
+    recipe = load_recipe(str(Path(__file__).parents[3] / "studies" / "detector_weights" / "more-scenes.toml"))
     frames = frames_of_first_scenes(recipe, MORE_SCENES)
     scenes = [scene_of_frame(recipe, index) for index in frames]
     assert len(set(scenes)) == MORE_SCENES
