@@ -4,28 +4,45 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import progress_report
 from droguekit.batch.render_dataset import render_dataset
 from nav.detector.detector_registry import network_file
 from nav.training.training_run import ONNX_FILE
+from nav.training.training_state import BEST_FILE
 from scenes.sampler import scene_of_frame
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
-from studies.world_variety.detection_by_drogue import score_by_drogue
+from studies.world_variety.detection_by_drogue import score_by_drogue, scores_side_by_side
 
 _HERE = Path(__file__).parent
 # Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
 CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
 # Of `more-scenes.toml`: as many as its rendering had completed when the training began.
 MORE_SCENES = 217
+# Flat rings without paths of light: pictures of a renderer that no other corpus has, at the others' size.
+FLAT = {
+    "name": "detector-flat",
+    "seed": 9,
+    "frames": {"count": 200, "scenes": 200, "empty_fraction": 0.1},
+    "rig": {
+        "preset": "rgb-ideal",
+        "encoding": "gamma",
+        "width_px": 640,
+        "height_px": 480,
+        "focal_px": 1066.6666666666667,
+    },
+    "render": {"engine": "analytic"},
+}
+# Folders of the corpora that the first training learns from, and of those that the second has besides.
+FIRST_CORPORA, SECOND_CORPORA = ("corpus", "more"), ("negatives", "flat")
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
 EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
 
@@ -37,7 +54,7 @@ def frames_of_first_scenes(recipe: Recipe, scenes: int) -> list[int]:
 
 
 def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
-    """Fetch photographs, render both corpora and the test sets, and train; what is there is not made again.
+    """Fetch photographs, render corpora and test sets, and train twice; what is there is not made again.
 
     Returns:
         The file of the trained network.
@@ -46,35 +63,49 @@ def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
     say(f"photographs of {', '.join(TRAINING_PACKAGES + TEST_PACKAGES)}")
     fetch_photographs(out / "photographs", TRAINING_PACKAGES)
     fetch_photographs(out / "test-photographs", TEST_PACKAGES)
-    say(f"{len(CORPUS_FRAMES)} pairs of detector-train")
-    render_dataset(load_recipe("detector-train"), out / "corpus", CORPUS_FRAMES, workers, progress_report())
-    more = load_recipe(str(_HERE / "more-scenes.toml"))
-    frames = frames_of_first_scenes(more.recipe, MORE_SCENES)
-    say(f"{len(frames)} pairs of {MORE_SCENES} more scenes")
-    render_dataset(more, out / "more", frames, workers, progress_report())
-    test = load_recipe(str(_HERE / "test.toml"))
-    say(f"{test.recipe.frames.count} pairs of the test set")
-    render_dataset(test, out / "test", range(test.recipe.frames.count), workers, progress_report())
-    without = load_recipe(str(_HERE / "test.toml"), changes=EMPTY)
-    say(f"{without.recipe.frames.count} pairs without a drogue")
-    render_dataset(without, out / "empty", range(without.recipe.frames.count), workers, progress_report())
-    log, folder = out / "log.txt", out / variant
+    for name, (source, frames) in _datasets().items():
+        say(f"{name}: {len(frames)} pairs of {source.recipe.name}")
+        render_dataset(source, out / name, frames, workers, progress_report())
+    log = out / "log.txt"
     say(f"training; {log} tells how far it is")
-    words = ["--settings", _HERE / f"{variant}.toml", "--device", device]
-    words += ["--photographs", out / "photographs", "--cache", out / "cache"]
-    run_droguekit("train", out / "corpus", out / "more", "--out", folder, *words, log=log)
-    return folder / ONNX_FILE
+    common = ["--device", device, "--photographs", out / "photographs", "--cache", out / "cache"]
+    first, second = out / f"{variant}-first", out / variant
+    run_droguekit(
+        "train",
+        *(out / name for name in FIRST_CORPORA),
+        *("--out", first, "--settings", _HERE / f"{variant}.toml", *common),
+        log=log,
+    )
+    run_droguekit(
+        "train",
+        *(out / name for name in FIRST_CORPORA + SECOND_CORPORA),
+        *("--out", second, "--settings", _HERE / f"{variant}-second.toml", "--start-from", first / BEST_FILE, *common),
+        log=log,
+    )
+    return second / ONNX_FILE
+
+
+def _datasets() -> dict[str, tuple[RecipeSource, Sequence[int]]]:
+    """Recipe and frames of each folder."""
+    more, test = load_recipe(str(_HERE / "more-scenes.toml")), str(_HERE / "test.toml")
+    whole = {
+        "negatives": load_recipe("detector-negatives"),
+        "flat": load_recipe("detector-small", changes=FLAT),
+        "test": load_recipe(test),
+        "empty": load_recipe(test, changes=EMPTY),
+    }
+    return {
+        "corpus": (load_recipe("detector-train"), CORPUS_FRAMES),
+        "more": (more, frames_of_first_scenes(more.recipe, MORE_SCENES)),
+        **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
+    }
 
 
 def score_lines(out: Path, detectors: dict[str, Path]) -> Iterator[str]:
     """A Markdown table of scores on the test set by drogue, and how many pictures without a drogue have a box."""
-    scores = {name: list(score_by_drogue(out / "test", str(path))) for name, path in detectors.items()}
-    heads = "".join(f" {name}: AP50, recall | false boxes |" for name in detectors)
-    yield f"| drogue | images | drogues |{heads}"
-    yield f"|---|---|---|{'---|---|' * len(detectors)}"
-    for rows in zip(*scores.values(), strict=True):
-        cells = "".join(f" {_percent(row.ap50)}, {_percent(row.recall)} | {row.false_boxes} |" for row in rows)
-        yield f"| {rows[0].kind} | {rows[0].images} | {rows[0].drogues} |{cells}"
+    yield from scores_side_by_side(
+        {name: list(score_by_drogue(out / "test", str(path))) for name, path in detectors.items()}
+    )
     for name, path in detectors.items():
         last = list(score_by_drogue(out / "empty", str(path)))[-1]
         yield f"{name}: {last.false_boxes} boxes in {last.images} images of frames without a drogue"
@@ -84,10 +115,6 @@ def score_lines(out: Path, detectors: dict[str, Path]) -> Iterator[str]:
         found = json.loads(boxes.read_text(encoding="utf-8"))
         with_box = {annotation["image_id"] for annotation in found["annotations"]}
         yield f"{name}: boxes in {len(with_box)} of {len(found['images'])} photographs without a drogue"
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def main(
@@ -101,7 +128,7 @@ def main(
     """Make weights of a detector and print hashes and scores."""
     try:
         new = make_weights(variant, out, workers, device)
-        for name in ("corpus", "more", "test", "empty"):
+        for name in _datasets():
             typer.echo(f"{name}: {Dataset(out / name).manifest.dataset_sha256}")
         typer.echo(f"{new}: {hashlib.sha256(new.read_bytes()).hexdigest()}")
         shipped = network_file(f"mobile-{variant}")

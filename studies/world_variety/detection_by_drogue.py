@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,6 +63,24 @@ def score_by_drogue(dataset: Path, detector: str) -> Iterator[KindScore]:
         false_boxes = int(((matches.score >= runner.score_threshold) & ~matches.is_true[AT_50]).sum())
         ap50 = evaluation.average_precision(some).ap50
         yield KindScore(kind, len(some), matches.drogues, ap50, point.recall, false_boxes)
+
+
+def scores_side_by_side(scores: Mapping[str, Sequence[KindScore]]) -> Iterator[str]:
+    """Lines of a Markdown table, a row for each kind of drogue.
+
+    Args:
+        scores: by a column's heading; all of the same kinds, in the same order.
+    """
+    heads = "".join(f" {name}: AP50, recall | false boxes |" for name in scores)
+    yield f"| drogue | images | drogues |{heads}"
+    yield f"|---|---|---|{'---|---|' * len(scores)}"
+    for rows in zip(*scores.values(), strict=True):
+        cells = "".join(f" {_percent(row.ap50)}, {_percent(row.recall)} | {row.false_boxes} |" for row in rows)
+        yield f"| {rows[0].kind} | {rows[0].images} | {rows[0].drogues} |{cells}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def drogue_kind(drogue: DrogueParameters | None) -> str:
