@@ -14,6 +14,8 @@ from render.blender_engine.messages import CameraPath, DistortedEye, ImageWindow
 from render.camera.exposure_motion import NEAREST_M, image_window
 
 _SHARP_BELOW_PX = 0.05
+# Blender silently makes smaller pictures as large as this.
+_LEAST_SIDE_PX = 4
 _MOMENTS = 5
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
@@ -51,7 +53,11 @@ class EyePath:
             corners_m: (V, 3) in the stage's axes. [m]
         """
         window = image_window(self._rig, self._poses, corners_m)
-        return None if window is None else _window(self._rig, self._eye, *window)
+        if window is None:
+            return None
+        last_first = np.array([self._camera.width_px, self._camera.height_px]) - _LEAST_SIDE_PX
+        first = np.minimum(window[0], last_first)
+        return _window(self._rig, self._eye, first, np.maximum(window[1], first + _LEAST_SIDE_PX))
 
 
 def contains(outer: ImageWindow | None, inner: ImageWindow) -> bool:
