@@ -27,6 +27,8 @@ _HERE = Path(__file__).parent
 CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
 # Of `more-scenes.toml`: as many as its rendering had completed when the training began.
 MORE_SCENES = 217
+# Of `detector-negatives`, for the same reason.
+NEGATIVE_SCENES = 240
 # Flat rings without paths of light: pictures of a renderer that no other corpus has, at the others' size.
 FLAT = {
     "name": "detector-flat",
@@ -87,9 +89,9 @@ def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
 
 def _datasets() -> dict[str, tuple[RecipeSource, Sequence[int]]]:
     """Recipe and frames of each folder."""
-    more, test = load_recipe(str(_HERE / "more-scenes.toml")), str(_HERE / "test.toml")
+    more, negatives = load_recipe(str(_HERE / "more-scenes.toml")), load_recipe("detector-negatives")
+    test = str(_HERE / "test.toml")
     whole = {
-        "negatives": load_recipe("detector-negatives"),
         "flat": load_recipe("detector-small", changes=FLAT),
         "test": load_recipe(test),
         "empty": load_recipe(test, changes=EMPTY),
@@ -97,6 +99,7 @@ def _datasets() -> dict[str, tuple[RecipeSource, Sequence[int]]]:
     return {
         "corpus": (load_recipe("detector-train"), CORPUS_FRAMES),
         "more": (more, frames_of_first_scenes(more.recipe, MORE_SCENES)),
+        "negatives": (negatives, frames_of_first_scenes(negatives.recipe, NEGATIVE_SCENES)),
         **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
     }
 
