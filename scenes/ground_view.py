@@ -73,6 +73,13 @@ def kept_tile(name: str, source: str, make: Callable[[], MipTile]) -> MipTile:
     return MipTile.from_arrays(kept_arrays(f"ground-{name}", sources, lambda: make().to_arrays()))
 
 
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """The same array for reading, as one from a file is: loops are compiled for every type, and this is another."""
+    values = values.view()
+    values.flags.writeable = False
+    return values
+
+
 class MipTile:
     """A periodic texture with mipmap levels of half, a quarter... its size.
 
@@ -83,7 +90,7 @@ class MipTile:
     """
 
     def __init__(self, texels: Field, texel_m: float, coded: bool = False) -> None:
-        self._texel_m, self._side, self._channels = texel_m, texels.shape[0], texels.shape[2]
+        self._texel_m, self._side, self._channels = float(texel_m), texels.shape[0], texels.shape[2]
         levels, level = [], texels
         while True:
             levels.append(level.ravel())
@@ -93,8 +100,8 @@ class MipTile:
             level = smaller.reshape(*smaller.shape[:2], self._channels)
         self._top, self._byte_levels = len(levels) - 1, _BYTE_LEVELS if coded else 0
         roots = [np.rint(255 * np.sqrt(np.clip(level, 0, 1))).astype(np.uint8) for level in levels[: self._byte_levels]]
-        self._roots = np.concatenate([*roots, np.zeros(0, np.uint8)])
-        self._values = np.concatenate([*levels[self._byte_levels :], np.zeros(0, np.float32)])
+        self._roots = _read_only(np.concatenate([*roots, np.zeros(0, np.uint8)]))
+        self._values = _read_only(np.concatenate([*levels[self._byte_levels :], np.zeros(0, np.float32)]))
         self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
         self.most = float(texels[..., 0].max())
 
@@ -102,7 +109,11 @@ class MipTile:
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """The texture whose `to_arrays` these are."""
         tile = cls.__new__(cls)
-        tile._roots, tile._values, tile.mean = arrays["roots"], arrays["values"], arrays["mean"]
+        tile._roots, tile._values, tile.mean = (
+            _read_only(arrays["roots"]),
+            _read_only(arrays["values"]),
+            arrays["mean"],
+        )
         tile._side, tile._channels, tile._top, tile._byte_levels = arrays["sizes"].tolist()
         tile._texel_m, tile.most = arrays["scales"].tolist()
         return tile
@@ -146,7 +157,9 @@ class MipTile:
         """
         shape = np.broadcast_shapes(middle_m[0].shape, width_m.shape)
         x_m, y_m, along_x_m, along_y_m, width_m = (
-            np.ascontiguousarray(part if part.size == 1 else np.broadcast_to(part, shape), dtype=np.float32).ravel()
+            _read_only(
+                np.ascontiguousarray(part if part.size == 1 else np.broadcast_to(part, shape), np.float32).ravel()
+            )
             for part in (*middle_m, *along_m, width_m)
         )
         total = np.zeros((int(np.prod(shape)), self._channels), dtype=np.float32)

@@ -20,6 +20,7 @@ import sys
 import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,12 @@ def sweep_kernel_cache(folder: Path) -> None:
                     Path(entry.path).unlink()
 
 
+@cache
+def _sweep_once(folder: Path) -> None:
+    """Sweep at this process's first look only: every kernel is opened, of which there may be thousands."""
+    sweep_kernel_cache(folder)
+
+
 def _is_spoilt(path: Path, now_s: float) -> bool:
     if path.name.endswith(".tmp"):
         return now_s - path.stat().st_mtime > _STALE_S
@@ -273,7 +280,7 @@ def probe_variant(device: Device = "cpu") -> Variant:
             "engine mitsuba: not installed; install it with: pip install 'droguekit[mitsuba]'"
         ) from error
     _provide_home()
-    sweep_kernel_cache(kernel_cache())
+    _sweep_once(kernel_cache())
     if device == "cuda":
         try:
             gpu = _gpu()

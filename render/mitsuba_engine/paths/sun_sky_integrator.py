@@ -165,9 +165,12 @@ def _cosines(height: int) -> NDArray[np.float32]:
     middle = (share * polar.reshape(rows, _BLOCK_PX)).sum(axis=1) / share.sum(axis=1)
     blocks = _directions(middle, 2 * height // _BLOCK_PX)
     plates = _directions((np.arange(_ROWS) + 0.5) * np.pi / _ROWS, 2 * _ROWS)
-    cosines = np.maximum(plates @ blocks.T, 0.0)
+    cosines = plates @ blocks.T
+    np.maximum(cosines, 0.0, out=cosines)
     totals = cosines @ np.repeat(share.sum(axis=1) * _BLOCK_PX, 2 * height // _BLOCK_PX)
-    result: NDArray[np.float32] = (cosines / totals[:, None]).astype(np.float32)
+    result: NDArray[np.float32] = np.empty(cosines.shape, dtype=np.float32)
+    # Rounded once, behind a division of doubles.
+    np.divide(cosines, totals[:, None], out=result, casting="same_kind")
     return result
 
 
