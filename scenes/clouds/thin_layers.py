@@ -25,6 +25,10 @@ _PATCH_SHADE = 0.3
 _FRESH_M = 60.0
 # Contrails: at most so many, the widths that they spread to with age, and how far they bend aside. [m]
 _MOST_TRAILS, _TRAIL_WIDTH_M, _TRAIL_BEND_M = 6, (_FRESH_M, 1200.0), 600.0
+# Their height and the size of their puffs, in their width; steps through the height.
+_TRAIL_HEIGHT, _PUFF, _TRAIL_STEPS = 0.35, 0.15, 8
+# The ray goes at most so far per height: lower ones are behind the layer's fading.
+_MOST_SLANT = 12.0
 
 
 @compiled
@@ -66,12 +70,12 @@ def _ice_depth(
 def _trail_depth(
     tiles: NDArray[np.float32], trails: NDArray[np.float64], places: NDArray[np.float64], depth: NDArray[np.float32]
 ) -> None:
-    """Fill in depth over its amount in a fresh contrail.
+    """Fill in depth over its amount in a fresh contrail, as the mean over the way through its height.
 
     Args:
         tiles: as `ice_tiles` gives them.
         trails: (K, 4) cosine and sine of the direction, distance from the origin across it, and width. [m]
-        places: (N, 3) east, north, and width of the ray. [m]
+        places: (N, 5) east, north, width of the ray [m], and how far east and north the ray goes per height.
         depth: (N,) filled in.
     """
     for index in range(places.shape[0]):
@@ -81,16 +85,28 @@ def _trail_depth(
             cosine, sine, aside_m, width_m = trails[which, 0], trails[which, 1], trails[which, 2], trails[which, 3]
             along_m, across_m = x_m * cosine + y_m * sine, y_m * cosine - x_m * sine - aside_m
             across_m += _TRAIL_BEND_M * 0.3 * tile_at(tiles[2], along_m / 260.0, 90.0 * which)
-            if abs(across_m) > 6.0 * width_m + 3.0 * ray_m:
+            high_m = _TRAIL_HEIGHT * width_m
+            way_along_m = high_m * (places[index, 3] * cosine + places[index, 4] * sine)
+            way_across_m = high_m * (places[index, 4] * cosine - places[index, 3] * sine)
+            if abs(across_m) > 6.0 * width_m + 3.0 * ray_m + 0.5 * abs(way_across_m):
                 continue
-            # Puffs hang below a trail, once as far apart as its own width.
-            puff = tile_at(tiles[2], along_m / width_m * 28.0, 40.0 * which + across_m / width_m * 9.0)
-            strand = tile_at(tiles[0], along_m / width_m * 9.0, across_m / width_m * 40.0)
-            spread_m = np.sqrt(width_m * width_m * (1.0 + 0.25 * puff) ** 2 + 0.25 * ray_m * ray_m)
-            near = across_m / spread_m + 0.35 * puff
-            # One edge is sharper, for the wind draws the other out.
-            fall = near * near * (0.35 if near > 0.0 else 1.6)
-            total += np.exp(-fall + 0.30 * strand + 0.25 * puff) * np.sqrt(_FRESH_M / spread_m)
+            # What lies between two steps, or two pixels, is seen as its mean.
+            slant = np.sqrt(1.0 + places[index, 3] ** 2 + places[index, 4] ** 2)
+            between_m = max(abs(way_along_m) / _TRAIL_STEPS, ray_m * slant)
+            seen = 1.0 / np.sqrt(1.0 + (between_m / (_PUFF * width_m)) ** 2)
+            spread = 0.0
+            for step in range(_TRAIL_STEPS):
+                share = (step + 0.5) / _TRAIL_STEPS - 0.5
+                a, c = along_m + share * way_along_m, across_m + share * way_across_m
+                # Puffs hang below a trail, once as far apart as its own width.
+                puff = seen * tile_at(tiles[2], a / width_m * 28.0, 40.0 * which + c / width_m * 9.0)
+                strand = seen * tile_at(tiles[0], a / width_m * 9.0, c / width_m * 40.0)
+                spread_m = np.sqrt(width_m * width_m * (1.0 + 0.25 * puff) ** 2 + 0.25 * ray_m * ray_m)
+                near = c / spread_m + 0.35 * puff
+                # One edge is sharper, for the wind draws the other out.
+                fall = near * near * (0.35 if near > 0.0 else 1.6)
+                spread += np.exp(-fall + 0.30 * strand + 0.25 * puff) * np.sqrt(_FRESH_M / spread_m)
+            total += spread / _TRAIL_STEPS
         depth[index] = total
 
 
@@ -122,7 +138,9 @@ def thin_depth(
     depth = np.empty(distance_m.size, dtype=np.float32)
     tiles = ice_tiles(layer.texture_seed)
     if layer.kind == "contrail":
-        places = np.stack([east_m.ravel(), north_m.ravel(), width_m.ravel()], axis=-1)
+        rise = np.maximum(np.abs(directions[..., 2:].astype(np.float64)), 1.0 / _MOST_SLANT)
+        slant = (directions[..., :2] / rise).reshape(-1, 2)
+        places = np.column_stack([east_m.ravel(), north_m.ravel(), width_m.ravel(), slant])
         _trail_depth(tiles, _trails(layer), places, depth)
     else:
         cosine, sine = (float(turn(np.radians(layer.heading_deg))) for turn in (np.cos, np.sin))

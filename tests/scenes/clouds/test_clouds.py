@@ -325,6 +325,19 @@ def test_rain_hangs_from_its_cloud_and_contrails_are_few() -> None:
         assert np.mean(render_cloud_layer(trails, rays, SIDE_LIGHT).opacity > 0.1) < most
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_contrails_towards_the_horizon_have_no_spikes(seed: int) -> None:
+    """A low ray goes a long way through a trail's height, so that its puffs are seen as their mean."""
+    trails = layer(kind="contrail", height_above_camera_m=5000.0, cover_fraction=1.0, feature_size_m=4000.0,
+                   optical_depth=0.6, texture_seed=seed)  # fmt: skip
+    rays = looking(320, 240, 600.0, 9.0)
+    opacity = render_cloud_layer(trails, rays, SIDE_LIGHT).opacity
+    low = np.degrees(np.arcsin(rays[..., 2]))
+    rows = (low[1:] > 4.6) & (low[1:] < 14.3)
+    # A flat layer's rows differ by 0.42 to 0.52 of the mean.
+    assert np.abs(np.diff(opacity, axis=0))[rows].mean() < 0.3 * opacity.mean()
+
+
 def test_patchy_mist_has_its_visibility_here_and_gaps_elsewhere() -> None:
     rays = upwards()
     even, patchy = (
