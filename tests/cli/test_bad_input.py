@@ -105,6 +105,30 @@ def test_an_engine_that_is_not_installed(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["benchmark", "none", "--detector", "color-blob", "--json", "folder"], "Is a directory"),
+        (["benchmark", "none", "--detector", "color-blob", "--html", "file/page.html"], "Not a directory"),
+        (["export", "none", "--format", "coco", "--out", "file"], "Not a directory"),
+        (["navigate", "none", "--out", f"{300 * 'x'}/estimates.jsonl"], "File name too long"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_told_before_the_work(
+    arguments: list[str],
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    # The dataset, which is not there either, has not been looked for.
+    assert run(arguments) == WRONG_INPUT
+    assert capsys.readouterr().err.strip() == f"droguekit: error: {arguments[-1]}: cannot be written: {reason}"
+
+
 def test_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     _assert_refused(_run("render", "smoke", "--out", tmp_path / "file" / "out"), r"file.*Not a directory")
