@@ -18,8 +18,8 @@ _FACE_MARGIN, _TUBE_SHARE = 2.5, 0.016
 
 _DROGUE = """# A drogue. Use it as `drogue = "{file}"` in a recipe, and look at it with
 # `droguekit model {file} --out drogue.glb`.
-# Lengths are in metres, reflectances from 0 to 1. docs/how-to/add-a-drogue.md explains every key, also those of markers
-# that are no even ring and of bodies such as baskets, leaves and cones.
+# Lengths are in metres, reflectances from 0 to 1. docs/how-to/add-a-drogue.md tells of markers that are no even ring and of
+# bodies such as baskets, leaves and cones; drogue_models/parameters.py of every key.
 name = "{name}"
 
 # Outermost radius, radius of the face's opening, and radius of the tube around the rim.
@@ -43,7 +43,7 @@ marker_reflectance_rgb = [0.8, 0.8, 0.8]
 # patterns = ["01", "1", "1", ...]
 """
 _RIG = """# A stereo rig. Use it as `rig = "{file}"` in a recipe.
-# The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/recipes.md lists them.
+# The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/conventions.md lists them.
 preset = "{preset}"
 
 # Size of an image, focal length over pixel pitch, and distance of the cameras.
