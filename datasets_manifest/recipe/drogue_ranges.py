@@ -19,6 +19,8 @@ class DistanceLaw(FrozenModel):
     Attributes:
         law: `uniform`, `log-uniform` or `uniform-image-size` (uniform in 1/distance) between `low_m` and `high_m`; or
             `stations`, which takes the values of `stations_m` in turn, frame by frame.
+        low_m, high_m: the law's ends; for all but `stations`. [m]
+        stations_m: distances; for `stations` alone. [m]
         edges_m, weights: ascending distances from `low_m` to `high_m`, and the share of the frames between neighbours,
             relative to the other weights; the law holds within each bin. None for the law from end to end. [m]
     """

@@ -57,6 +57,9 @@ class FrameCounts(FrozenModel):
     """Numbers of pairs and scenes, and the share of pairs without a drogue.
 
     Attributes:
+        count: number of pairs.
+        scenes: number of scenes, among which the pairs are shared; each has its own sky, ground, tanker and drogue.
+        empty_fraction: share of the pairs that show no drogue.
         stream: what keys the random streams beside the seed: recipes with two of them draw independently. In TOML the
             recipe's name by default; empty for the seed alone, as in datasets from before there was this key.
         in_turn: whether scenes go through families and drogue variants in the given order, so that a few sequences have
@@ -104,13 +107,21 @@ class RenderSettings(FrozenModel):
 
 
 class Outputs(FrozenModel):
-    """Optional files besides images, part ids and records."""
+    """Optional files besides images, part ids and records.
+
+    Attributes:
+        exr: whether every pair has EXR files of radiance, depth and normals.
+    """
 
     exr: bool = False
 
 
 class Split(FrozenModel):
-    """Shares of the scenes in each split."""
+    """Shares of the scenes in each split.
+
+    Attributes:
+        train, val, test: shares of the scenes; they add up to 1.
+    """
 
     train: Fraction = 1.0
     val: Fraction = 0.0
@@ -152,6 +163,7 @@ class Recipe(FrozenModel):
 
     Attributes:
         name: of the dataset.
+        description: for people; the dataset's card has it.
         family: name of the conditions, for tables, in recipes without `families`.
         seed: of all random streams, together with `frames.stream`.
         drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).

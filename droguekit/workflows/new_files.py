@@ -18,8 +18,8 @@ _FACE_MARGIN, _TUBE_SHARE = 2.5, 0.016
 
 _DROGUE = """# A drogue. Use it as `drogue = "{file}"` in a recipe, and look at it with
 # `droguekit model {file} --out drogue.glb`.
-# Lengths are in metres, reflectances from 0 to 1. docs/how-to/add-a-drogue.md tells of markers that are no even ring and of
-# bodies such as baskets, leaves and cones; drogue_models/parameters.py of every key.
+# Lengths are in metres, reflectances from 0 to 1. docs/how-to/add-a-drogue.md tells of markers in no even ring and
+# of bodies such as baskets, leaves and cones; drogue_models/parameters.py of every key.
 name = "{name}"
 
 # Outermost radius, radius of the face's opening, and radius of the tube around the rim.
@@ -67,7 +67,7 @@ pixel_pitch_um = 3.75
 """
 _RECIPE = """# A recipe. `droguekit check {file}` predicts how well the markers can be measured,
 # `droguekit plan {file}` how long it takes, and `droguekit render {file} --out data/{name}` makes it.
-# docs/reference/recipes.md explains every key.
+# docs/reference/recipe-keys.md explains every key.
 name = "{name}"
 drogue = "{drogue}"
 rig = "{rig}"

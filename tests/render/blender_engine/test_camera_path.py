@@ -26,7 +26,7 @@ def test_a_window_at_the_image_s_edge_is_as_large_as_blender_s_smallest_picture(
     assert min(window.width_px, window.height_px) >= LEAST_SIDE_PX
     # Parts of the image at its edge, and no larger than they need be.
     first = np.array([window.left_px, window.top_px])
-    end = first + (window.width_px, window.height_px)
+    end = first + np.array([window.width_px, window.height_px])
     assert (first >= 0).all() and (end <= size_px).all()
     assert (end[side > 0] == size_px[side > 0]).all() and (first[side < 0] == 0).all()
     assert max(window.width_px, window.height_px) <= 6
