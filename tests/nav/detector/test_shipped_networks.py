@@ -13,12 +13,14 @@ from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
+from studies.detector_weights.__main__ import FLAT
 
 NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs/reference/detectors.md"
 # Those that do not ship with the package.
-RECIPES = {"detector-weights": str(ROOT / "studies/detector_weights/more-scenes.toml")}
+MORE_SCENES = str(ROOT / "studies/detector_weights/more-scenes.toml")
+RECIPES = {"detector-weights": (MORE_SCENES, {}), "detector-flat": ("detector-small", FLAT)}
 
 
 def shipped(name: str) -> OnnxDetector:
@@ -50,7 +52,8 @@ def test_a_network_says_where_it_comes_from(name: str) -> None:
 def test_no_test_scene_is_one_that_was_learned(name: str) -> None:
     # Scenes follow from a recipe's seed and their number.
     datasets = [corpus for corpus in shipped(name).metadata.training["datasets"] if corpus["name"] != "photographs"]
-    learned = {load_recipe(RECIPES.get(corpus["name"], corpus["name"])).recipe.seed for corpus in datasets}
+    recipes = (RECIPES.get(corpus["name"], (corpus["name"], {})) for corpus in datasets)
+    learned = {load_recipe(recipe, changes=changes).recipe.seed for recipe, changes in recipes}
     assert load_recipe("detector-test").recipe.seed not in learned
 
 
