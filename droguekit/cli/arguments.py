@@ -33,9 +33,11 @@ def _local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
         return None
     if "://" in text:
         raise ValueError(f"{option.opts[0]}: must be a folder or file of this machine, got {text}")
-    path = Path(text)
+    path, is_folder = Path(text), str(option.metavar).startswith("DIR")
     try:
-        reason = _why_unwritable(path, is_folder=str(option.metavar).startswith("DIR"))
+        if not is_folder and path.is_dir():
+            raise ValueError(f"{option.opts[0]}: must be a file, got the folder {path}")
+        reason = _why_unwritable(path, is_folder)
     except OSError as error:  # a name that is too long, or a folder that nobody may look into
         reason = error.errno
     if reason is not None:
@@ -46,8 +48,8 @@ def _local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
 def _why_unwritable(path: Path, is_folder: bool) -> int | None:
     """The error's number of a place that surely cannot be written; None where it may succeed."""
     if path.exists():
-        if path.is_dir() != is_folder:
-            return errno.ENOTDIR if is_folder else errno.EISDIR
+        if is_folder and not path.is_dir():
+            return errno.ENOTDIR
         if not is_folder and not path.is_file():
             return None  # a device or pipe, which is opened and not replaced
     folder = path if is_folder else path.parent

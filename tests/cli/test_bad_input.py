@@ -108,7 +108,6 @@ def test_an_engine_that_is_not_installed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["benchmark", "none", "--detector", "color-blob", "--json", "folder"], "Is a directory"),
         (["benchmark", "none", "--detector", "color-blob", "--html", "file/page.html"], "Not a directory"),
         (["export", "none", "--format", "coco", "--out", "file"], "Not a directory"),
         (["navigate", "none", "--out", f"{300 * 'x'}/estimates.jsonl"], "File name too long"),
@@ -121,7 +120,6 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     monkeypatch.chdir(tmp_path)
     # The dataset, which is not there either, has not been looked for.
