@@ -275,7 +275,7 @@ def test_wrong_orders_are_refused_on_one_line(tiny: Path, tmp_path: Path, capsys
     page = str(tmp_path / "page")
     cases = [
         ([str(tiny), "--out", str(tmp_path / "mine")], "mine: exists already and is no page of this command"),
-        ([str(tiny), "--out", str(tmp_path / "file")], "file: exists already and is no page of this command"),
+        ([str(tiny), "--out", str(tmp_path / "file")], "file: cannot be written: Not a directory"),
         ([str(tiny), "--out", "/proc/nowhere/page"], "/proc/nowhere/page: cannot be written"),
         ([str(tiny), "--out", page, "--estimates", str(tmp_path / "far.jsonl")], "frame 40 is not in the dataset"),
         ([str(tiny), "--out", page, "--estimates", str(tmp_path / "none.jsonl")], "none.jsonl: cannot be read"),
