@@ -27,7 +27,7 @@ _FRESH_M = 60.0
 _MOST_TRAILS, _TRAIL_WIDTH_M, _TRAIL_BEND_M = 6, (_FRESH_M, 1200.0), 600.0
 # Their height and the size of their puffs, in their width; steps through the height.
 _TRAIL_HEIGHT, _PUFF, _TRAIL_STEPS = 0.35, 0.15, 4
-# The ray goes at most so far per height: lower ones are behind the layer's fading.
+# The ray goes at most so far per height: its opacity is not of a lower rise either (`_render_ice`).
 _MOST_SLANT = 12.0
 
 
