@@ -82,7 +82,7 @@ def navigate(
         dataset: images, rig and drogue.
         methods: names from `method_names`.
         centroids: `own` for the centroids that each method is made for, `binary` or `edge` for the same ones for all.
-        detector: a name from `nav.detector.detector_registry.detector_names`, or a network's file.
+        detector: see `detector_factory`.
 
     Yields:
         One estimate per frame and method, in that order; no fix, with the reason, for a pair that cannot be read.
@@ -99,7 +99,7 @@ def open_navigator(settings: SequenceSettings, detector: str | None = None) -> S
 
     Args:
         settings: what it measures.
-        detector: a name from `nav.detector.detector_registry.detector_names`, or a network's file; by default ours.
+        detector: see `detector_factory`; by default ours.
 
     Raises:
         ValueError: a method, detector or tracker that does not exist, or a setting out of range.

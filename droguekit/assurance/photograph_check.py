@@ -29,7 +29,7 @@ from droguekit.scoring.results.detection_result import (
     image_id_of,
 )
 from droguekit.scoring.results.pose_result import ResultModel
-from nav.detector.detector_registry import network_file
+from nav.detector.detector_registry import open_network
 from nav.detector.onnx_detector import OnnxDetector
 
 _LEAST_SCORE = 0.001
@@ -146,7 +146,7 @@ def check_photographs(
 
     Args:
         folder: of the photographs, each of any size.
-        detector: a shipped network, or a file `*.onnx`.
+        detector: a shipped network, or a file `*.onnx`, either with `@HEIGHTxWIDTH` behind it or not.
         report: is told of the progress.
         boxes: COCO file of boxes that somebody drew; pictures that it names without a box show no drogue.
         category: of the boxes; None for drogue.
@@ -162,10 +162,12 @@ def check_photographs(
         raise ValueError("--box-category: needs --boxes")
     paths = find_photographs(folder)
     drawn_boxes = None if boxes is None else read_boxes(boxes, category)
-    file = network_file(detector)
-    if file is None:
-        raise ValueError(f"--detector: must be a network that ships with droguekit or a file *.onnx, got {detector!r}")
-    network = OnnxDetector(file, file.stem)
+    network = open_network(detector)
+    if network is None:
+        raise ValueError(
+            "--detector: must be a network that ships with droguekit or a file *.onnx, also with @HEIGHTxWIDTH behind "
+            f"it, got {detector!r}"
+        )
     looks = None if known is None else known_looks(Dataset(known), report)
     seen, unreadable = _seen(folder, paths, network, report)
     drawn = {}

@@ -109,7 +109,10 @@ WorkersOption = Annotated[
 DetectorOption = Annotated[
     str | None,
     typer.Option(
-        "--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/reference/detectors.md."
+        "--detector",
+        metavar="NAME|FILE.onnx",
+        help="A detector's name, or a network, perhaps with @HEIGHTxWIDTH of its input behind it; "
+        "docs/reference/detectors.md.",
     ),
 ]
 EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]

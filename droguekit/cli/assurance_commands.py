@@ -170,7 +170,10 @@ def real_check(
         str | None, typer.Option("--box-category", metavar="NAME", help="Of the boxes that count; drogue by default.")
     ] = None,
     detector: Annotated[
-        str, typer.Option("--detector", metavar="NAME|FILE.onnx", help="Network to look with.")
+        str,
+        typer.Option(
+            "--detector", metavar="NAME|FILE.onnx", help="Network to look with, perhaps with @HEIGHTxWIDTH behind it."
+        ),
     ] = "mobile-s",
     least_score: Annotated[
         float | None,

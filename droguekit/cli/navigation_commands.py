@@ -23,6 +23,7 @@ EXAMPLES = {
         "droguekit detect data/demo --out detections.json",
         "droguekit detect data/demo --detector color-blob --out color-blob.json",
         "droguekit detect data/flight --detector my-network.onnx --out detections.json",
+        "droguekit detect data/flight --detector mobile-s@960x1280 --out small.json   (larger input: smaller drogues)",
         "droguekit detect data/docking-10m --tracker bernoulli --out tracked.json",
         "droguekit detect photographs --mono --out boxes.json   (single pictures of any size)",
     ),
@@ -354,7 +355,11 @@ def benchmark(
     ] = None,
     detector: Annotated[
         list[str] | None,
-        typer.Option("--detector", metavar="NAME|FILE.onnx", help="Run a detector and score it. Repeatable."),
+        typer.Option(
+            "--detector",
+            metavar="NAME|FILE.onnx",
+            help="Run a detector and score it; a network perhaps with @HEIGHTxWIDTH behind it. Repeatable.",
+        ),
     ] = None,
     split: Annotated[
         str | None,

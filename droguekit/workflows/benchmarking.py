@@ -242,9 +242,9 @@ def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> N
     """Cost of all passes through a network file; None where it cannot be computed or onnx is missing."""
     from importlib.util import find_spec
 
-    from nav.detector.detector_registry import network_file
+    from nav.detector.detector_registry import network_file, split_input_size
 
-    file = network_file(name_or_file)
+    file = network_file(split_input_size(name_or_file)[0])
     if file is None or not sizes_px or find_spec("onnx") is None:
         return None
     from nav.detector.onnx_cost import NetworkCost, network_cost

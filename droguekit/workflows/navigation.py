@@ -137,7 +137,7 @@ class NavigationOptions:
 
     Attributes:
         centroids: how centres are measured: `own`, `binary` or `edge`.
-        detector: name or file of a network; the default one when None.
+        detector: see `detector_factory`; the default one when None.
         tracker: name; the detector runs on every pair when None.
         redetect_every: pairs between two checks of the tracker by the detector; the default number when None.
         filtered, smoothed: whether to add filtered and smoothed estimates.

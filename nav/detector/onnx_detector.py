@@ -68,7 +68,8 @@ class OnnxDetector:
         self.metadata = _read_metadata(file, self._session, fixed_size)
         self.input_size_px = input_size_px or fixed_size or self.metadata.input_size_px
         if fixed_size and self.input_size_px != fixed_size:
-            raise ValueError(f"{file}: takes {fixed_size[0]}x{fixed_size[1]} px only, asked for {self.input_size_px}")
+            width, height = self.input_size_px
+            raise ValueError(f"{file}: takes {fixed_size[0]}x{fixed_size[1]} px only, asked for {width}x{height} px")
         letterbox(self.input_size_px, self.input_size_px)
         if fixed_size and self.metadata.large_from_px:
             raise ValueError(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,7 @@ from nav.detector.detector_registry import (
     detector_names,
     network_file,
     open_detector,
+    split_input_size,
 )
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.ring_detectors import ColorBlobDetector
@@ -58,6 +60,31 @@ def test_a_file_is_opened_once_and_called_by_its_name(tmp_path: Path) -> None:
     make = detector_factory(str(file))
     assert make(DROGUE).name == "squares"
     assert make(DROGUE) is make(PRESETS["white-8"])
+
+
+def test_a_network_looks_at_the_size_behind_its_name(tmp_path: Path) -> None:
+    file = write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(320, 256)))
+    detector = detector_factory(f"{file}@512x640")(DROGUE)
+    assert detector.name == "squares@512x640" and detector.input_size_px == (640, 512)
+    assert split_input_size(f"{file}@512x640") == (str(file), (640, 512))
+    # Neither is a size.
+    for name in ("mobile-s", "at@home/mine.onnx", "mine@512.onnx"):
+        assert split_input_size(name) == (name, None)
+
+
+@pytest.mark.parametrize(
+    ("size", "fault"),
+    [
+        ("500x640", "detector: height and width must be multiples of 32 up to 4096, got "),
+        ("32000x32000", "squares.onnx@32000x32000'"),
+        ("0x0", "must be multiples of 32 up to 4096"),
+        ("640", "detector: must be one of"),
+    ],
+)
+def test_a_size_that_no_network_takes_is_refused(tmp_path: Path, size: str, fault: str) -> None:
+    file = write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(320, 256)))
+    with pytest.raises(ValueError, match=re.escape(fault)):
+        detector_factory(f"{file}@{size}")
 
 
 def test_color_blob_has_the_detection_as_its_only_candidate() -> None:

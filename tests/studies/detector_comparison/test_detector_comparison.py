@@ -230,6 +230,7 @@ def test_a_network_of_ours_that_cannot_be_counted_is_refused_before_anything_is_
     assert list(tmp_path.iterdir()) == [odd]
 
 
+@pytest.mark.slow
 def test_trained_peers_are_timed_and_scored_by_the_benchmark(screen_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     truth = {image.image_id: image for image in read_detection_truth(screen_dataset).images if image.split == "test"}
@@ -277,6 +278,7 @@ def test_the_front_holds_what_no_other_beats_in_both(points: list[tuple[float, f
     assert pareto_front(points) == front
 
 
+@pytest.mark.slow
 def test_the_pairs_of_the_test_dataset_are_scored(screen_dataset: Path, smoke_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for name in PEERS:
@@ -313,11 +315,15 @@ def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes
 def test_a_benchmark_accepts_networks_whose_operations_cannot_be_counted(screen_dataset: Path, tmp_path: Path) -> None:
     plain, odd = (write_maps_network(tmp_path / f"{name}.onnx", name == "plain") for name in ("plain", "odd"))
     words = ["benchmark", str(screen_dataset), "--detector", str(plain), "--detector", str(odd)]
+    words += ["--detector", f"{plain}@128x64"]
     assert run([*words, "--json", str(tmp_path / "scores.json")]) == DONE
     scores = json.loads((tmp_path / "scores.json").read_text())["detectors"]
     # Each scale has 64 / stride squared places of 5 channels, each of 3 stride^2 products, and the weights for them.
     assert scores["plain"]["gflops_per_image"] == pytest.approx(2e-9 * 3 * 5 * 3 * 64**2, rel=1e-9)
     assert scores["plain"]["parameters"] == 5 * 3 * (8**2 + 16**2 + 32**2)
+    assert scores["plain@128x64"]["gflops_per_image"] == pytest.approx(
+        2 * scores["plain"]["gflops_per_image"], rel=1e-9
+    )
     assert (scores["odd"]["gflops_per_image"], scores["odd"]["parameters"]) == (None, None)
     assert scores["odd"]["times"]["pairs"] == 6
 
