@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,6 +110,7 @@ def predict(
     batch_images: int,
     large_from_px: float,
     compute: ComputeDevice,
+    advance: Callable[[], None] = lambda: None,
 ) -> Predictions:
     """Run a network on the images of both eyes of a split, without augmentation.
 
@@ -122,6 +123,7 @@ def predict(
         large_from_px: boxes whose longer side is at least this come from a second pass at half the size, as in the
             detector; 0 for a single pass.
         compute: device and precision.
+        advance: called after each batch.
     """
     members = [(int(pair), eye) for pair in corpus.split(split) for eye in (0, 1)]
     groups = [members[start : start + batch_images] for start in range(0, len(members), batch_images)]
@@ -139,6 +141,7 @@ def predict(
     for group in prefetch_map(read, groups, threads=1, ahead=2):
         found += detect_multiscale([image for image, _ in group], run, large_from_px, _MIN_SCORE, MAX_BOXES)
         truth += [boxes for _, boxes in group]
+        advance()
     return Predictions(truth, found)
 
 

@@ -1,9 +1,9 @@
 """The training loop: batches of augmented images, optimizer steps, validation after each epoch, checkpoints.
 
 A batch is a function of the settings, the corpus and its number. An epoch shows every training image once, in an order
-of its own. A mosaic shows one such image beside three that are drawn at random. Where there are photographs without a
-drogue, they take the places of some of the three, and of some images alone. Into some images a drogue of another one is
-pasted.
+of its own, unless some make way for hard ones. A mosaic shows one such image beside three that are drawn at random.
+Where there are photographs without a drogue, they take the places of some of the three, and of some images alone. Into
+some images a drogue of another one is pasted.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import cos, pi
 from pathlib import Path
 from typing import NamedTuple
@@ -61,6 +61,7 @@ _WHOLE_FRACTION = 0.25  # of the others: the whole image, as in the detector
 # Scales are relative to that at which the image just fits the network's input.
 _MOSAIC_RANGES = ViewRanges(scale=(0.4, 1.4), rotation_deg=4, flip_fraction=0.5)
 _SINGLE_RANGES = ViewRanges(scale=(0.65, 1.5), rotation_deg=4, flip_fraction=0.5)
+NO_PAIRS = np.zeros(0, dtype=np.int64)
 _AHEAD_BATCHES = 2
 _STEPS_PER_CURVE_POINT = 10
 # Validation every third epoch before the last input size; the best weights are chosen among those at that size. In a
@@ -100,11 +101,13 @@ class Batch:
 class BatchMaker:
     """Makes the batch of any step of a training."""
 
-    def __init__(self, corpus: Corpus, settings: TrainingSettings) -> None:
+    def __init__(self, corpus: Corpus, settings: TrainingSettings, hard_pairs: NDArray[np.int64] = NO_PAIRS) -> None:
         self._corpus, self._settings = corpus, settings
         self._pairs = corpus.split("train")
         # A sample is the image of one eye, or those of both eyes of a pair.
         self._eyes = 2 if settings.views == "both" else 1
+        is_hard = np.isin(self._pairs, hard_pairs)
+        self._hard_samples = np.flatnonzero(is_hard if self._eyes == 2 else np.repeat(is_hard, 2))
         self._samples_per_epoch = 2 * len(self._pairs) // self._eyes
         self._samples_per_batch = settings.batch_images // self._eyes
 
@@ -148,6 +151,8 @@ class BatchMaker:
         order = sample_generator(settings.seed, epoch, 0, "order").permutation(self._samples_per_epoch)
         rng = sample_generator(settings.seed, epoch, position, "geometry")
         first = int(order[position])
+        if len(self._hard_samples) and rng.random() < settings.hard_fraction:
+            first = int(rng.choice(self._hard_samples))
         is_mosaic = settings.mosaic_at(step) and rng.random() < settings.mosaic_fraction
         samples = [first, *rng.integers(self._samples_per_epoch, size=TILES - 1)] if is_mosaic else [first]
         # The first of the four may be in any corner.
@@ -290,6 +295,7 @@ class Trainer:
         out: folder of checkpoint, tables and curves.
         observer: is informed of every step and epoch.
         should_stop: called after every step.
+        hard_pairs: (n,) indices of pairs that take the place of others as often as `hard_fraction` says.
     """
 
     corpus: Corpus
@@ -298,6 +304,7 @@ class Trainer:
     out: Path
     observer: TrainingObserver
     should_stop: Callable[[], bool]
+    hard_pairs: NDArray[np.int64] = field(default_factory=lambda: NO_PAIRS)
 
     def run(self, state: TrainingState) -> None:
         """Train from a state to the end.
@@ -322,7 +329,7 @@ class Trainer:
             self.observer.end()
 
     def _run(self, state: TrainingState) -> None:
-        settings, maker = self.settings, BatchMaker(self.corpus, self.settings)
+        settings, maker = self.settings, BatchMaker(self.corpus, self.settings, self.hard_pairs)
         curves = TensorBoardCurves(self.out, state.step * settings.batch_images)
         batches = maker.batches(range(state.step, settings.steps), settings.loader_workers)
         saved_s = began_s = time.monotonic()

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
@@ -24,10 +26,11 @@ from nav.training.evaluation import (
     predict,
     statistics_batches,
 )
+from nav.training.hard_pairs import hard_pairs
 from nav.training.onnx_conversion import export_onnx, recalibrate_batch_norm
-from nav.training.trainer import Trainer
+from nav.training.trainer import NO_PAIRS, Trainer
 from nav.training.training_progress import TrainingObserver
-from nav.training.training_settings import TrainingSettings
+from nav.training.training_settings import TrainingSettings, size_text
 from nav.training.training_state import (
     BEST_FILE,
     ComputeDevice,
@@ -49,6 +52,7 @@ from nav.training.training_state import (
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
 _LOCK_FILE = ".lock"
 _DEFAULT_THRESHOLD = 0.5
+_NO_CPU_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,8 @@ def train(
 
     Raises:
         ValueError: a dataset or photograph that cannot be used, a device that is not available, weights of another
-            network, a folder of another training, or one that another run uses; the message names the path.
+            network, a folder of another training, or one that another run uses, or too little memory for a batch; the
+            message names the path or setting.
         OSError: a file cannot be written.
         KeyboardInterrupt: `should_stop` returned true; the state is saved, and the same call resumes the training.
     """
@@ -103,7 +108,7 @@ def train(
     compute = open_compute_device(settings)
     _check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    with _locked(out), limit_threads(settings.threads):
+    with _locked(out), limit_threads(settings.threads), _lack_of_memory_told(settings, compute):
         remove_partial_files(out)
         size, threads = settings.largest_size_px, settings.loader_workers
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop, photographs)
@@ -114,7 +119,13 @@ def train(
         _load_best(out, state)
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
         observer.say(_summary(corpus, settings, compute, state))
-        Trainer(corpus, settings, compute, out, observer, should_stop).run(state)
+        hard = NO_PAIRS
+        if start is not None and settings.hard_fraction:
+            hard = hard_pairs(out, start, corpus, settings, compute, observer, should_stop)
+            observer.say(
+                f"the weights at the start fail in {len(hard)} of {len(corpus.split('train'))} pairs to train on"
+            )
+        Trainer(corpus, settings, compute, out, observer, should_stop, hard).run(state)
         return _evaluate_and_export(out, corpus, settings, compute, state)
 
 
@@ -145,6 +156,21 @@ def _locked(out: Path) -> Iterator[None]:
         if not try_lock(lock):
             raise ValueError(f"{out}: another training is running in it; wait for its end, or give another folder")
         yield
+
+
+@contextmanager
+def _lack_of_memory_told(settings: TrainingSettings, compute: ComputeDevice) -> Iterator[None]:
+    """Turn a lack of memory, which numpy and torch tell in their own ways, into one line."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        # Torch has no class of its own for the CPU's memory.
+        if not isinstance(error, MemoryError | torch.OutOfMemoryError) and _NO_CPU_MEMORY not in str(error):
+            raise
+        raise ValueError(
+            f"batch_images: {settings.batch_images} images of {size_text(settings.largest_size_px)} need more memory "
+            f"than {compute.device.type} has left; train with fewer or smaller ones, into another folder"
+        ) from error
 
 
 def _recalibrate_start(

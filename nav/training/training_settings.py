@@ -32,6 +32,8 @@ class TrainingSettings(FrozenModel):
         photograph_fraction: of the images that are drawn at random, so many are photographs without a drogue where the
             training has any: of the other three in a mosaic, and of the images alone.
         pasted_fraction: of all images and photographs, so many get a drogue that is cut out of another pair.
+        hard_fraction: of the samples of an epoch, whole images or the first of a mosaic, so many make way for pairs in
+            which the weights that the training starts from fail (`nav.training.hard_pairs`).
         size_px: (height, width) of the network's input.
         final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`.
         image_passes: number of images that pass forwards and backwards through the network in the whole training.
@@ -71,6 +73,7 @@ class TrainingSettings(FrozenModel):
     plain_fraction: float = Field(default=0.15, ge=0, le=1)
     photograph_fraction: float = Field(default=0.2, ge=0, lt=1)
     pasted_fraction: float = Field(default=0.3, ge=0, le=1)
+    hard_fraction: float = Field(default=0.0, ge=0, le=1, exclude_if=lambda share: not share)
     size_px: SizePx = (480, 640)
     final_size_px: SizePx | None = None
     final_fraction: float = Field(default=0.5, gt=0, lt=1)

@@ -457,9 +457,11 @@ def settings_from_start(settings: TrainingSettings, start: StartingWeights | Non
     """The settings, with the hash of the weights that the training starts from.
 
     Raises:
-        ValueError: the settings have the hash of other weights.
+        ValueError: the settings have the hash of other weights, or need weights to start from.
     """
     given = "" if start is None else start.sha256
+    if settings.hard_fraction and start is None:
+        raise ValueError("hard_fraction: needs weights to start from, whose failures make pairs hard")
     if settings.start_sha256 not in ("", given):
         raise ValueError(
             f"start_sha256: {settings.start_sha256} is not that of the weights given, {given or 'none'}; "

@@ -190,6 +190,7 @@ def test_the_files_of_a_training(split_dataset: Path, tmp_path: Path) -> None:
         run(split_dataset, tmp_path, **changes)
 
 
+@pytest.mark.slow
 def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, tmp_path: Path) -> None:
     result, _ = run(split_dataset, tmp_path, image_passes=4, precision="bf16")
     settings = build_settings(None, SMALL)
@@ -206,6 +207,7 @@ def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, t
         np.testing.assert_allclose(got, reference, atol=2e-4 * max(1.0, float(reference.abs().max())))
 
 
+@pytest.mark.slow
 def test_several_datasets_have_no_hash_of_one(split_dataset: Path, tmp_path: Path) -> None:
     second = render_toy(tmp_path / "second", seed=6, frames={"count": 2, "scenes": 1, "empty_fraction": None})
     changes = {"image_passes": 4, "final_size_px": (64, 96), "final_fraction": 0.5}
@@ -290,3 +292,34 @@ def test_forty_pairs_are_memorised(toy_dataset: Path, tmp_path: Path) -> None:
         )
     reached = average_precision(predictions.truth, predictions.found)
     assert reached is not None and reached.ap50 >= 0.95
+
+
+# Enough memory for the images of a batch, but not for what the network makes of them.
+STARVED = """
+import io, resource, sys
+from pathlib import Path
+from droguekit.batch.progress import PlainProgress
+from nav.training.training_settings import TrainingSettings
+from nav.training.training_run import train
+
+settings = TrainingSettings.model_validate_json(sys.argv[3])
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+limit = pages * resource.getpagesize() + 2**31
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+try:
+    train([Path(sys.argv[1])], Path(sys.argv[2]), settings, PlainProgress(io.StringIO()))
+except ValueError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_lack_of_memory_is_told_in_one_line(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(
+        None, {**SMALL, "batch_images": 1024, "size_px": (256, 320), "image_passes": 2048, "mosaic": False}
+    )
+    command = [sys.executable, "-c", STARVED, str(split_dataset), str(tmp_path / "out"), settings.model_dump_json()]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    told = "batch_images: 1024 images of 256x320 need more memory than cpu has left; train with fewer or smaller ones"
+    assert ended.stdout.strip() == f"{told}, into another folder"
