@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import Recipe
@@ -188,7 +188,7 @@ def label_logarithmic(axis: Axis, low: float, high: float) -> None:
         subs = next(subs for ratio, subs in _LABELS if high < ratio * low)
         axis.set_major_locator(LogLocator(base=10, subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 def draw_figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.pair_faults import PairFaults
@@ -290,7 +290,7 @@ def length_series(figure_name: str, run: DockingRun, contenders: Sequence[Conten
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(base=10, numticks=12))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_minor_locator(NullLocator())
         _finish(axes, run, "Length of the position error [mm], logarithmic")
         label = "Length of the position error over the image number, logarithmic"
         return svg_element(figure, f"{figure_name}-length", label)
@@ -415,7 +415,7 @@ def station_panel(run: SemiPhysicalRun, anchor: str, axis: Axis) -> str:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(base=10, numticks=12))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.set_title(shown.title, fontsize=10.5, loc="left")
         axes.set_xlabel("Distance [m]")
         _grid(axes)
