@@ -116,7 +116,7 @@ _CLASSES = {one.__name__: one for one in _subclasses(FrozenModel)}
 
 
 def _limits(model: type[FrozenModel]) -> dict[str, tuple[float, float]]:
-    """Limits of ranges, as the class's validators check them when it is made with its defaults."""
+    """Limits of ranges, as the class's validators check them when it is made with little but its defaults."""
     constants = vars(sys.modules[model.__module__])
     checks = re.findall(r"self\.(\w+)\.within\(([-\w.]+), ([-\w.]+),", inspect.getsource(model))
     found = {name: (_constant(low, constants), _constant(high, constants)) for name, low, high in checks}
@@ -124,10 +124,22 @@ def _limits(model: type[FrozenModel]) -> dict[str, tuple[float, float]]:
     def note(self: Range, low: float, high: float, name: str) -> None:
         found[name.rpartition(".")[2]] = low, high
 
-    # A class that has keys without a default cannot be made so; checks in a loop are not seen then.
+    needed = {name: _any_value(field.annotation) for name, field in model.model_fields.items() if field.is_required()}
+    # Not every class takes any values; checks in a loop are not seen then.
     with patch.object(Range, "within", note), suppress(ValidationError):
-        model()
+        model(**needed)
     return found
+
+
+def _any_value(annotation: Any) -> Any:
+    """A value for a key that has no default: one of those to choose from, or a list of one; else None."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)[0]
+    if get_origin(annotation) is tuple:
+        return (_any_value(get_args(annotation)[0]),)
+    if get_origin(annotation) in (Union, UnionType):
+        return _any_value(get_args(annotation)[0])
+    return None
 
 
 def _constant(text: str, constants: Mapping[str, Any]) -> float:
