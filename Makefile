@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-device bench-variety bench-detectors detector-weights bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs kernels test test-slow test-readers test-container torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-device bench-variety bench-detectors detector-weights bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -26,13 +26,20 @@ docs: ## build the documentation into out/docs (installs mkdocs-material and mkd
 # Three processes for two cores: tests of commands and pages spend much of their time waiting for other processes.
 # A process that crashes ends the run and names its test: if it were replaced, the others might wait for ever
 # (pytest-xdist 3.8).
-test: setup lint ## linters, types and the fast tests
+PYTEST := $(BIN)/python -m pytest --numprocesses 3 --dist loadfile --max-worker-restart 0
+test: setup ## linters, types and the fast tests
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint kernels
 	@echo "test: pytest, the fast tests"
-	@$(BIN)/python -m pytest -m "not slow" --numprocesses 3 --dist loadfile --max-worker-restart 0
+	@$(PYTEST) -m "not slow"
 
-test-slow: setup ## the tests that render for longer
+test-slow: setup kernels ## the tests that take longer
 	@echo "test-slow: pytest, the slow tests"
-	@$(BIN)/python -m pytest -m "slow and not torture"
+	@$(PYTEST) -m "slow and not torture"
+
+# Before processes of the tests start side by side: each would compile the same loops, for a minute.
+kernels: setup ## compile the loops that numba keeps on disk
+	@echo "kernels: compiling loops"
+	@$(BIN)/python -m tests.support.compiled_kernels
 
 test-readers: setup ## read the exports with datasets, datumaro, evo, FiftyOne, Label Studio's SDK and ultralytics (installs them under out/readers)
 	@scripts/readers
@@ -84,7 +91,7 @@ bench-detectors: ## detectors OURS=FILE.onnx beside five of ultralytics, trained
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
-detector-weights: ## make the shipped mobile-l anew: photographs, corpora, two trainings, scores (hours; Debian 12; NVIDIA GPU; resumes)
+detector-weights: ## make the shipped mobile-l anew: photographs, corpora, three trainings, scores (hours; Debian 12; NVIDIA GPU; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_weights --out out/detector-weights
 

@@ -227,6 +227,7 @@ def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
     assert render_recipe(out, workers=0, text=QUICK_RECIPE).kept == len(made_before(2))
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_clock_changes_nothing(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:
     library = tmp_path / "jumping_clock.so"
     source = tmp_path / "jumping_clock.c"

@@ -222,6 +222,7 @@ def test_a_frame_that_hangs_ends_its_worker_and_is_made_by_the_next(
     assert file_hashes(layout.frame_folder(out, 1)) == file_hashes(layout.frame_folder(quick_dataset, 1))
 
 
+@pytest.mark.slow
 def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
     start: Start,
     analytic_dataset: Path,

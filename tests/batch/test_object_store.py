@@ -127,6 +127,7 @@ def packed(server: ThreadedMotoServer, text: str) -> str:
     return place
 
 
+@pytest.mark.slow
 def test_commands_read_it_there(packed: str, local: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number, dataset in enumerate((str(local), packed)):
         out = tmp_path / str(number)
@@ -188,6 +189,7 @@ def test_a_hostile_listing_changes_nothing(
     assert [*tmp_path.iterdir()] == [out]
 
 
+@pytest.mark.slow
 def test_a_changed_tar_file_is_found(text: str, place: str) -> None:
     render_recipe(place, range(2), ExecutionOptions(0, pairs_per_tar=2), text)
     storage = open_storage(place)
@@ -206,6 +208,7 @@ def test_a_changed_tar_file_is_found(text: str, place: str) -> None:
     assert validate_dataset(place).passed
 
 
+@pytest.mark.slow
 def test_shards_are_merged_from_there_and_to_there(local: Path, place: str, text: str, tmp_path: Path) -> None:
     render_recipe(f"{place}/even", range(0, 5, 2), ExecutionOptions(0, pairs_per_tar=4), text)
     render_recipe(tmp_path / "odd", range(1, 5, 2), 0, text)

@@ -22,6 +22,7 @@ from geometry.se3 import RigidTransform
 from studies.paper.paper_report import read_detection
 from studies.paper.published_results import CONTENDERS
 
+pytestmark = pytest.mark.slow
 OpenPage = Callable[..., Any]
 
 # Panels of Figures 10 (3), 11 (1), 16 (5), 17 (3), 18 (4) and 19 (4).

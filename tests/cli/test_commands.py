@@ -164,6 +164,7 @@ def test_demo_reports_a_few_pairs_first(
     assert "first report" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_the_slow_variant_is_announced_and_no_other_one_continues_its_dataset(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -215,7 +215,9 @@ def test_citation_names_this_version() -> None:
 
 def test_the_workflow_and_the_hooks_are_what_they_should_be() -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML comes with mkdocs: pip install 'droguekit[docs]'")
-    (job,) = yaml.safe_load(text(".github/workflows/ci.yml"))["jobs"].values()
+    jobs = yaml.safe_load(text(".github/workflows/ci.yml"))["jobs"]
+    assert any(step.get("run") == "make test-slow" for step in jobs["slow"]["steps"])
+    job = jobs["test"]
     # The oldest and the newest Python that the project is tested with.
     assert job["strategy"]["matrix"]["python-version"] == ["3.11", "3.14"] and len(job["strategy"]["matrix"]["os"]) >= 2
     (test,) = (step for step in job["steps"] if step.get("run") == "bash .ci/run")

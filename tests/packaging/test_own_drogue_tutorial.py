@@ -15,7 +15,8 @@ from droguekit.cli.main import DONE, run
 PAGE = Path(__file__).parents[2] / "docs/tutorial/your-own-drogue.md"
 
 
-# Ten commands on eight pairs of 960 x 600 take half a minute: they are what the page promises.
+# Ten commands on eight pairs of 960 x 600.
+@pytest.mark.slow
 def test_every_command_of_the_page_runs_and_ends_in_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)

@@ -173,6 +173,7 @@ def test_only_dirt_and_bold_maps_count_as_edges_all_over(frame: FrameSpec) -> No
         np.testing.assert_allclose(face.reflectance, face.painted.reflectance * np.float32(fraction), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_maps_leave_smoothed_light_unbiased(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
     worst = SurfaceWear(seed=2, soot=0.8, oil=0.8, edge_wear=0.8, fading=0.8, tape=0.5)

@@ -69,6 +69,7 @@ def test_every_body_is_closed_and_outward(name: TankerType) -> None:
             assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0, role
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(PROPELLERS))
 @pytest.mark.parametrize("sweep_deg", [0.0, 20.0, 360.0])
 def test_blades_are_closed_and_outward(name: TankerType, sweep_deg: float) -> None:
@@ -140,6 +141,7 @@ def test_left_and_right_stations_mirror_each_other(name: TankerType) -> None:
     np.testing.assert_allclose(np.ptp(left, axis=0), np.ptp(right, axis=0), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 def test_no_camera_sees_an_inner_face(name: TankerType) -> None:
     recipe = build_recipe(

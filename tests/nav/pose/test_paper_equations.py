@@ -164,6 +164,7 @@ def mean_errors_mm(markers: int, bad: bool) -> tuple[float, float]:
     return means[0], means[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("markers", "least_loss"), [(5, 1.5), (8, 1.0)])
 def test_the_step_in_depth_brings_little_and_costs_where_a_marker_is_wrong(markers: int, least_loss: float) -> None:
     with_step, without = mean_errors_mm(markers, bad=False)

@@ -141,6 +141,7 @@ def test_settings_precede_the_network_of_the_weights(tmp_path: Path) -> None:
     assert (settings.variant, settings.attention, settings.fusion) == ("s", "eca", "asff")
 
 
+@pytest.mark.slow
 def test_a_resumed_training_keeps_what_it_learned_and_not_its_start(split_dataset: Path, tmp_path: Path) -> None:
     start, settings = read_starting_weights("mobile-s"), build_settings(None, {**SMALL, "image_passes": 16})
     whole = train([split_dataset], tmp_path / "whole", settings, PlainProgress(io.StringIO()), start=start)

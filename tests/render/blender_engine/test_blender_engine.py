@@ -126,6 +126,7 @@ def test_passes_of_pixel_centres(blender: BlenderEngine) -> None:
     assert check_against_passes(label_frame(frame, radiance, expose(frame, radiance)), radiance) == []
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_both_path_tracers_agree(blender: BlenderEngine, engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=36)
@@ -147,6 +148,7 @@ def test_both_path_tracers_agree(blender: BlenderEngine, engine: RenderEngine) -
             assert got[0] == pytest.approx(got[1], rel=0.02), name
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_rough_plastic_means_the_same_to_both(blender: BlenderEngine, engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(1.8,), samples=36)

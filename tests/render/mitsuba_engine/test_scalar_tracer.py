@@ -73,6 +73,8 @@ part_id, depth, normal = view.passes(scene, 0.0)
 np.savez(sys.argv[2], part_id=part_id, depth=depth, normal=normal)
 """
 
+pytestmark = pytest.mark.slow
+
 
 def test_where_a_ray_slipped_through_what_stands_beside_is_seen(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")

@@ -84,6 +84,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, F
         yield folder, data, measure_flight_tier(options(), [data], folder / "out", PlainProgress(io.StringIO()))
 
 
+@pytest.mark.slow
 def test_flights_are_rendered_navigated_and_judged(measured: tuple[Path, FlightData, list[AcceptanceRow]]) -> None:
     folder, _, rows = measured
     made = folder / "out" / "analytic" / "small-flights"
@@ -129,6 +130,7 @@ def test_scores_are_those_of_the_records(measured: tuple[Path, FlightData, list[
         np.testing.assert_array_equal(scored.error[:3], offset_m)
 
 
+@pytest.mark.slow
 def test_what_is_there_is_kept(
     measured: tuple[Path, FlightData, list[AcceptanceRow]],
 ) -> None:
@@ -212,6 +214,7 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
     assert (tmp_path / "analytic" / "day" / "benchmark.json").exists()
 
 
+@pytest.mark.slow
 def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.acceptance.__main__._TIMED_PAIRS", 1)
     told = io.StringIO()

@@ -87,6 +87,7 @@ def test_a_file_of_something_else_is_an_error(tmp_path: Path, text: str) -> None
         run_cells([CELL], tmp_path, Listener())
 
 
+@pytest.mark.slow
 def test_tier_c_runs_through(tmp_path: Path) -> None:
     rows = measure_tier_c(tmp_path, 1, 10, Listener())
     assert [row.bar for row in rows] == ["5", "5", "6", "6", "7", "7", "9", "9", "10", "10", "10"]
