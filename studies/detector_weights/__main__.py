@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,6 +19,7 @@ from nav.detector.detector_registry import network_file
 from nav.training.training_run import ONNX_FILE
 from nav.training.training_state import BEST_FILE
 from scenes.sampler import scene_of_frame
+from studies.detector_weights.plain_grounds import write_plain_grounds
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
 from studies.world_variety.detection_by_drogue import score_by_drogue, scores_side_by_side
@@ -43,8 +45,10 @@ FLAT = {
     },
     "render": {"engine": "analytic"},
 }
-# Folders of the corpora that the first training learns from, and of those that the second has besides.
-FIRST_CORPORA, SECOND_CORPORA = ("corpus", "more"), ("negatives", "flat")
+# Folders of the corpora that the first training learns from, and of those that the others have besides.
+FIRST_CORPORA, OTHER_CORPORA = ("corpus", "more"), ("negatives", "flat")
+# Beside the photographs of the third training.
+PLAIN_GROUNDS = 24
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
 EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
 
@@ -56,7 +60,7 @@ def frames_of_first_scenes(recipe: Recipe, scenes: int) -> list[int]:
 
 
 def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
-    """Fetch photographs, render corpora and test sets, and train twice; what is there is not made again.
+    """Fetch photographs, render corpora and test sets, and train three times; what is there is not made again.
 
     Returns:
         The file of the trained network.
@@ -70,21 +74,24 @@ def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
         render_dataset(source, out / name, frames, workers, progress_report())
     log = out / "log.txt"
     say(f"training; {log} tells how far it is")
-    common = ["--device", device, "--photographs", out / "photographs", "--cache", out / "cache"]
-    first, second = out / f"{variant}-first", out / variant
-    run_droguekit(
-        "train",
-        *(out / name for name in FIRST_CORPORA),
-        *("--out", first, "--settings", _HERE / f"{variant}.toml", *common),
-        log=log,
-    )
-    run_droguekit(
-        "train",
-        *(out / name for name in FIRST_CORPORA + SECOND_CORPORA),
-        *("--out", second, "--settings", _HERE / f"{variant}-second.toml", "--start-from", first / BEST_FILE, *common),
-        log=log,
-    )
-    return second / ONNX_FILE
+    every = [out / name for name in FIRST_CORPORA + OTHER_CORPORA]
+    photographs, on_grounds = out / "photographs", out / "photographs-and-grounds"
+    shutil.rmtree(on_grounds, ignore_errors=True)
+    shutil.copytree(photographs, on_grounds)
+    write_plain_grounds(on_grounds / "plain-grounds", PLAIN_GROUNDS)
+    before: Path | None = None
+    for name, corpora, pictures in (
+        ("first", every[: len(FIRST_CORPORA)], photographs),
+        ("second", every, photographs),
+        ("third", every, on_grounds),
+    ):
+        trained = out / f"{variant}-{name}"
+        words = ["--out", trained, "--settings", _HERE / f"{variant}-{name}.toml", "--photographs", pictures]
+        words += [] if before is None else ["--start-from", before / BEST_FILE]
+        run_droguekit("train", *corpora, *words, "--device", device, "--cache", out / "cache", log=log)
+        before = trained
+    assert before is not None
+    return before / ONNX_FILE
 
 
 def _datasets() -> dict[str, tuple[RecipeSource, Sequence[int]]]:

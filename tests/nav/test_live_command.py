@@ -300,6 +300,7 @@ def test_a_full_disk_ends_the_run_and_leaves_whole_lines(
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
     command = [sys.executable, "-m", "droguekit.cli.main", *live(video, calibration, out, "--method", "joint")]
+    command += ["--detector", "color-blob"]  # to the networks the drawn disc is no drogue
     done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit)
     count = len(list(read_estimates(out)))
     assert done.returncode == FAULT
