@@ -93,7 +93,7 @@ class Usage:
 
 
 def usage_over_frames() -> list[Usage] | None:
-    """Renders fifty frames of other drogues, paints, obstacles, distances and motions, then the first ten again.
+    """Renders fifty frames of other drogues, paints, obstacles, distances and motions, then the first ten twice again.
 
     None for the scalar variant.
     """
@@ -106,7 +106,7 @@ def usage_over_frames() -> list[Usage] | None:
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     known: set[str] = set()
     usage = []
-    for index in [*range(recipe.frames.count), *range(10)]:
+    for index in [*range(recipe.frames.count), *range(10), *range(10)]:
         dr.kernel_history_clear()
         engine.render(sample_frame(recipe, index), recipe.render)
         taken = {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
@@ -116,16 +116,19 @@ def usage_over_frames() -> list[Usage] | None:
     return usage
 
 
-@pytest.mark.slow  # 60 frames
+@pytest.mark.slow  # 70 frames
 def test_kernels_and_memory_settle_over_the_frames_of_a_varied_recipe() -> None:
     usage = run_in_own_process(usage_over_frames)
     if usage is None:
         pytest.skip("the scalar variant compiles nothing")
-    early, late, again = usage[:25], usage[25:50], usage[50:]
+    early, late, again, settled = usage[:25], usage[25:50], usage[50:60], usage[60:]
     assert sum(after.new_kernels for after in early) > 30
     # The number of paths from a pixel, one of few, is compiled into a kernel; rare ones may come late.
     assert sum(after.new_kernels for after in late) <= 3, str(usage)
-    # A frame that is nearer than all before takes more; frames that were rendered before take nothing more.
-    assert sum(after.new_kernels for after in again) == 0
-    assert again[-1].allocated_bytes == late[-1].allocated_bytes
-    assert again[-1].resident_gib <= 1.05 * late[-1].resident_gib
+    # Frames that were rendered before meet other kept scenes, whose kinds of paint are compiled into calls. Once these
+    # were there too, nothing more is taken.
+    assert sum(after.new_kernels for after in again) <= 2, str(usage)
+    assert sum(after.new_kernels for after in settled) == 0, str(usage)
+    # A frame that is nearer than all before takes more memory.
+    assert settled[-1].allocated_bytes == late[-1].allocated_bytes
+    assert settled[-1].resident_gib <= 1.05 * late[-1].resident_gib
