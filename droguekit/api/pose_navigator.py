@@ -46,7 +46,8 @@ class Navigator:
             rig: the cameras.
             drogue: the drogue to look for.
             method: name of a pose method, see `droguekit navigate --help`.
-            detector: name of a shipped one, or a network file `*.onnx`; see `detector_factory`.
+            detector: name of a shipped one, or a network file `*.onnx`; a network also with the height and width of its
+                input behind it, as in `mobile-s@960x1280`.
             encoding: of the arrays that are passed in: `linear` in the light, as the shipped recipes render, or `gamma`
                 (the sRGB curve), as most cameras deliver 8 bits. A wrong one costs accuracy.
             black_level_dn: pixel value without light. [DN]
