@@ -101,9 +101,13 @@ class EnvironmentRadiance:
             _rows_with(directions[..., 2] * np.sign(layer.height_above_camera_m) > (lowest if layer.is_above else 0.0))
             for layer in layers
         ]
-        pictures = [
-            self._cloud(layer, directions[rows], horizon[rows]) for layer, rows in zip(layers, parts, strict=True)
-        ]
+        pictures, behind = [], sky.copy()
+        for layer, part in zip(layers, parts, strict=True):
+            # What is behind a layer below the camera is known later.
+            known = behind[part] if layer.is_above else None
+            pictures.append(self._cloud(layer, directions[part], horizon[part], known))
+            if layer.is_above:
+                behind[part] = pictures[-1][..., :3] + (1.0 - pictures[-1][..., 3:]) * behind[part]
         rows = _rows_with(directions[..., 2] < self._ground_below(directions))
         uncovered = np.ones(directions.shape[:2], dtype=np.float32)
         for layer, part, picture in zip(layers, parts, pictures, strict=True):
@@ -204,8 +208,17 @@ class EnvironmentRadiance:
         level[..., 2] = -np.minimum(falls, np.float32(1.0))
         return level
 
-    def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
-        """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity."""
+    def _cloud(
+        self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance, behind: Radiance | None
+    ) -> Radiance:
+        """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity.
+
+        Args:
+            layer: its description.
+            directions: (H, W, 3) unit vectors in world axes.
+            air: (H, W, 3) the second result of `sky_and_air`. [cd/m2]
+            behind: as for `CloudLayerRenderer.picture`.
+        """
         if directions.size == 0:
             return np.zeros((*directions.shape[:2], 4), dtype=np.float32)
         light, offset_m = self.air.light_on(layer), self.environment.camera_offset_m
@@ -216,7 +229,7 @@ class EnvironmentRadiance:
             return self.air.before_cloud(seen, rays[indices], distance_m, behind_air[indices])
 
         if directions.shape[0] * directions.shape[1] >= _MANY_RAYS:
-            return renderer.picture(directions, through_air)
+            return renderer.picture(directions, through_air, behind)
         seen = renderer.view(directions, pixel_angle_rad(directions))
         lit = self.air.before_cloud(seen.radiance, directions, seen.distance_m, air)
         layered: Radiance = np.concatenate([lit * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)

@@ -51,7 +51,7 @@ _CREASE, _THIN, _LEAVES, _RIM, _VEIL = 0.8, 0.75, 0.55, 0.45, 0.2
 # Step between the first rays of a large picture, and how much of the way to the nearest cloud around is free of it.
 _FIRST_STEP_PX, _BEFORE_CLOUD, _ROW = 8, 0.96, 256
 # Steps between further rays, of which those are marched whose neighbours, twice as far apart, differ more than this.
-_REFINEMENTS = ((2, 0.08), (1, 0.35))
+_REFINEMENTS, _REFINEMENTS_THIN = ((2, 0.08), (1, 0.35)), ((1, 0.05),)
 
 
 @dataclass(frozen=True)
@@ -247,16 +247,20 @@ class CloudLayerRenderer:
         """The layer along (H, W, 3) unit directions in any order; detail smaller than `pixel_rad` is left out."""
         return self._march(directions, pixel_rad).view
 
-    def picture(self, directions: NDArray[np.float32], through_air: ThroughAir) -> Radiance:
+    def picture(
+        self, directions: NDArray[np.float32], through_air: ThroughAir, behind: Radiance | None = None
+    ) -> Radiance:
         """The layer in a large picture, behind air.
 
-        Rays are marched every fourth down and across, then every second and at last every single one where their
-        neighbours differ, from where neighbours met cloud; the rest is interpolated.
+        Rays are marched every fourth down and across, then every second and at last every single one where neighbours
+        differ in what is seen, from where neighbours met cloud; the rest is interpolated. Layers without depth begin
+        with every second ray.
 
         Args:
             directions: (H, W, 3) unit vectors; neighbours in the array are neighbours in direction.
             through_air: takes light (h, w, 3), distance (h, w) [m] and flat indices (h, w) of rays, and gives the light
                 that is left of it and that of the air.
+            behind: (H, W, 3) light that comes from behind the layer [cd/m2]; None if it is not known.
 
         Returns:
             (H, W, 4) light times opacity, and opacity.
@@ -270,7 +274,7 @@ class CloudLayerRenderer:
             entry_m = self._march(
                 rays[np.ascontiguousarray(indices[::every, ::every])], 0.5 * every * pixel_rad
             ).entry_m
-        refinements = _REFINEMENTS[1:] if thin else _REFINEMENTS
+        refinements = _REFINEMENTS_THIN if thin else _REFINEMENTS
         coarse = np.ascontiguousarray(indices[:: 2 * refinements[0][0], :: 2 * refinements[0][0]])
         found = self._march(rays[coarse], pixel_rad, self._starts(entry_m, every, coarse, width))
         picture = self._layered(found.view, coarse, through_air)
@@ -280,7 +284,10 @@ class CloudLayerRenderer:
             finer = np.ascontiguousarray(indices[::step_px, ::step_px])
             large = np.empty((*finer.shape, 4), dtype=np.float32)
             edge = np.empty(finer.shape, dtype=np.bool_)
-            enlarge(picture, 2, contrast, large, edge)
+            seen = picture[..., :3]
+            if behind is not None:
+                seen = seen + (1.0 - picture[..., 3:]) * behind[:: 2 * step_px, :: 2 * step_px]
+            enlarge(picture, np.ascontiguousarray(seen), behind is None, 2, contrast, large, edge)
             if len(places := np.flatnonzero(edge)):
                 # Rows of rays, as pictures have.
                 places = np.resize(places, (-(-len(places) // _ROW), _ROW))

@@ -23,6 +23,8 @@ _SUN_STEPS = 5
 # Each octave of lumps is finer by this factor and turned by these cosines and sines about two axes.
 _FINER = 2.13
 _MASK, _TILE_PX, _LUMPS_MASK = 511, 512.0, 63
+# No lump of `lump_volume` is higher.
+HIGHEST_LUMP = 0.33
 # Lumps grow on the surface, and outside it down to this share of their amount.
 _LUMP_REACH = 0.3
 # Heaps of cloud are narrower below this share of their height, by so much at the base.
@@ -79,7 +81,8 @@ def excess_at(
 ) -> float:
     """How deep a place is inside the cloud, about; negative outside. [m]
 
-    Far from the surface it is a bound on that side of which it is: what remains of the detail cannot change the side.
+    Where detail is seen but cannot change the side of the surface, it is a bound: the place is at most as deep, or at
+    least. Without detail, with a `detail_m` above all lumps, it is exact.
 
     Args:
         shape: see `CloudShape`.
@@ -96,6 +99,8 @@ def excess_at(
         return float(-0.5 * thick_m - (-0.1 - h) * thick_m)
     if h > 1.2:
         return float(-0.1 * thick_m - (h - 1.2) * thick_m)
+    # A lump of less than 1.4 details is not seen, one of 2.8 fully.
+    seen = 0.7 * fine_m / detail_m
     # The patterns repeat along axes at this angle to the flight; otherwise repeats would line up in the view ahead.
     texels_per_m, lumps_per_m = _BLOB_TEXELS / size_m, 1.0 / lump_m
     u = (x_m * 0.93233 + y_m * 0.36162) * texels_per_m
@@ -108,13 +113,16 @@ def excess_at(
         fall = shape[12] * square + shape[13] * square * square + _UNDERCUT * under * under
         wide = tile_at(body, u, v) - threshold
         wide /= 1.0 + 0.25 * max(wide, 0.0)
+        amount = lump_amount * (0.35 + h)
         # The most that lumps of all sizes can add.
-        most = metric_m * (wide - fall + 0.5 * lump_amount * (0.35 + h)) + 0.33 * fine_amount_m / (1.0 - gain)
-        if most < 0.0:
+        most = metric_m * (wide + amount * 1.5 * HIGHEST_LUMP - fall) + HIGHEST_LUMP * fine_amount_m / (1.0 - gain)
+        if most < 0.0 and seen > 1.0:
             return float(most)
         swell = lump_at(lumps, lx, ly, lz)
+        most += metric_m * amount * (swell - HIGHEST_LUMP)
+        if most < 0.0 and seen > 1.0:
+            return float(most)
         turret = lump_at(lumps, 2.2 * ly + 0.3, 2.2 * lz, 2.2 * lx)
-        amount = lump_amount * (0.35 + h)
         excess = metric_m * (wide + amount * (swell + 0.5 * turret) - fall)
         floor = height_m - 0.03 * thick_m * (1.0 - swell)
         fine = min(max(0.35 + 2.5 * h, 0.35), 1.0)
@@ -136,12 +144,11 @@ def excess_at(
         fine = 1.0
     remaining_m = fine * fine_amount_m / (1.0 - gain)
     amount_m, scale = fine * fine_amount_m, 1.0 / fine_m
-    # A lump of less than 1.4 details is not seen, one of 2.8 fully.
-    seen, deep_m = 0.7 * fine_m / detail_m, 3.0 * shape[11]
+    deep_m = 3.0 * shape[11]
     px, py, pz = x_m * scale + 1.7 * shift, y_m * scale, height_m * scale
     while seen > 1.0:
-        if excess + 0.33 * remaining_m < 0.0:
-            return float(excess + 0.33 * remaining_m)
+        if excess + HIGHEST_LUMP * remaining_m < 0.0:
+            return float(excess + HIGHEST_LUMP * remaining_m)
         if excess - remaining_m > deep_m:
             return float(excess - remaining_m)
         excess = _with_lump(excess, amount_m * min(seen - 1.0, 1.0), lump_at(lumps, px, py, pz))
@@ -324,14 +331,23 @@ def starts_of(entry_m: NDArray[np.float32], every: int, index: NDArray[np.int64]
 
 @compiled
 def enlarge(
-    coarse: NDArray[np.float32], every: int, contrast: float, large: NDArray[np.float32], edge: NDArray[np.bool_]
+    coarse: NDArray[np.float32],
+    seen: NDArray[np.float32],
+    by_opacity: bool,
+    every: int,
+    contrast: float,
+    large: NDArray[np.float32],
+    edge: NDArray[np.bool_],
 ) -> None:
     """Fill in a picture between every `every`-th of its rays, and mark where that is not good enough.
 
     Args:
         coarse: (h, w, 4) light times opacity, and opacity, of every `every`-th ray down and across.
+        seen: (h, w, 3) light of these rays with what is behind the layer.
+        by_opacity: whether opacity marks edges too, because what is behind is not known.
         every: see there.
-        contrast: of light, over that of the brightest corner, or of opacity, between corners that marks an edge.
+        contrast: of light in any channel, over that of the brightest corner, or of opacity, between corners that marks
+            an edge.
         large: (H, W, 4) filled in.
         edge: (H, W) filled in.
     """
@@ -349,10 +365,14 @@ def enlarge(
                 large[row, column, c] = upper * (one - b) + lower * b
             marked = False
             if a > 0 or b > 0:
-                for c in range(1, 4, 2):
-                    most = max(max(coarse[j, i, c], coarse[j, right, c]), max(coarse[k, i, c], coarse[k, right, c]))
-                    least = min(min(coarse[j, i, c], coarse[j, right, c]), min(coarse[k, i, c], coarse[k, right, c]))
-                    marked = marked or most - least > contrast * (most if c == 1 else one)
+                for c in range(3):
+                    most = max(max(seen[j, i, c], seen[j, right, c]), max(seen[k, i, c], seen[k, right, c]))
+                    least = min(min(seen[j, i, c], seen[j, right, c]), min(seen[k, i, c], seen[k, right, c]))
+                    marked = marked or most - least > contrast * most
+                if by_opacity and not marked:
+                    most = max(max(coarse[j, i, 3], coarse[j, right, 3]), max(coarse[k, i, 3], coarse[k, right, 3]))
+                    least = min(min(coarse[j, i, 3], coarse[j, right, 3]), min(coarse[k, i, 3], coarse[k, right, 3]))
+                    marked = most - least > contrast
             edge[row, column] = marked
 
 

@@ -36,6 +36,9 @@ _BELOW_CAMERA, _CONE = 0.45, 0.20
 _STEEP_SINE = 0.45
 _STEPS, _COVERED_STEPS, _MOST_COLUMNS, _FAR_M = 256, 640, 1500, 1.6e5
 _COARSE_PX = 8
+# The heights of a profile are averages over pieces as wide as long. So many profiles pass over each piece; between them
+# heights are interpolated.
+_PROFILES_PER_PIECE = 6
 # No trees or houses are closer to the camera than this.
 _NEAREST_COVER_M = 100.0
 
@@ -225,17 +228,37 @@ class Terrain:
         nearest_m = self._altitude_m * (1.0 - _BELOW_CAMERA) * 1.2
         steps = _STEPS if cover is None else _COVERED_STEPS
         distances = np.geomspace(nearest_m, max(_FAR_M, 3 * nearest_m), steps)
-        level_m = np.broadcast_to(distances.astype(np.float32), (len(azimuths_rad), steps))
-        cosine, sine = (turn(azimuths_rad).astype(np.float32)[:, None] for turn in (np.cos, np.sin))
-        x_m, y_m = cosine * level_m + np.float32(offset_m[0]), sine * level_m + np.float32(offset_m[1])
-        width_m = level_m * np.float32(max(angle_rad, distances[1] / distances[0] - 1.0))
-        height_m = self.heights(x_m, y_m, width_m)[0] if not self.is_level else np.zeros_like(x_m)
-        if cover is not None:
-            height_m = height_m + cover(x_m, y_m, level_m * np.float32(angle_rad))
+        height_m = self._heights_along(azimuths_rad, distances, angle_rad, offset_m, cover)
         rise = (height_m.astype(np.float64) - self._altitude_m) / distances
         if self._is_round:
             rise -= distances / (2 * EARTH_M)
         return distances, np.maximum.accumulate(rise, axis=1)
+
+    def _heights_along(
+        self,
+        azimuths_rad: NDArray[np.float64],
+        distances: NDArray[np.float64],
+        angle_rad: float,
+        offset_m: tuple[float, float],
+        cover: Heights | None,
+    ) -> Field:
+        """(A, D) heights of the land with its cover at level distances in each direction. [m]"""
+
+        def places(turned_rad: NDArray[np.float64]) -> tuple[Field, Field, Field]:
+            level_m = np.broadcast_to(distances.astype(np.float32), (len(turned_rad), len(distances)))
+            cosine, sine = (turn(turned_rad).astype(np.float32)[:, None] for turn in (np.cos, np.sin))
+            return cosine * level_m + np.float32(offset_m[0]), sine * level_m + np.float32(offset_m[1]), level_m
+
+        piece_rad = max(angle_rad, distances[1] / distances[0] - 1.0)
+        first, last = float(azimuths_rad[0]), float(azimuths_rad[-1])
+        profiles = min(int((last - first) / piece_rad * _PROFILES_PER_PIECE) + 2, len(azimuths_rad))
+        x_m, y_m, level_m = places(np.linspace(first, last, profiles))
+        bare_m, _ = self.heights(x_m, y_m, level_m * np.float32(piece_rad))
+        height_m = _with_rows(bare_m, len(azimuths_rad))
+        if cover is not None:
+            x_m, y_m, level_m = places(azimuths_rad)
+            height_m = height_m + cover(x_m, y_m, level_m * np.float32(angle_rad))
+        return height_m
 
 
 def highest_sine(kind: GroundKind, altitude_m: float, cover_m: float) -> float:
@@ -255,3 +278,12 @@ def _enlarged(coarse: Field, every: int, shape: tuple[int, int]) -> Field:
     u = np.arange(shape[1], dtype=np.float32)[None, :] / np.float32(every)
     columns, rows = np.broadcast_to(u, shape), np.broadcast_to(v, shape)
     return np.asarray(sample_bilinear(coarse, columns, rows, cv2.BORDER_REPLICATE), dtype=np.float32)
+
+
+def _with_rows(image: Field, rows: int) -> Field:
+    """An image enlarged to so many rows; the first and the last stay."""
+    place = np.linspace(0.0, image.shape[0] - 1, rows)
+    above = np.minimum(place.astype(int), image.shape[0] - 2)
+    share = (place - above).astype(np.float32)[:, None]
+    larger: Field = image[above] * (1 - share) + image[above + 1] * share
+    return larger

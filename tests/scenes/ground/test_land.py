@@ -101,6 +101,21 @@ def test_level_land_is_met_where_a_plane_is() -> None:
     assert (seen.share == 1.0).all()
 
 
+def test_profiles_between_directions_are_as_good_as_one_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heights between profiles are interpolated: the outline errs by less, the more profiles pass over a piece."""
+    directions = rays(1.0, 16.0, rows=240, columns=640)
+    terrain = Terrain("mountains", 3000.0, SHIFT_M, False)
+
+    def outline_px(profiles: int) -> np.ndarray:
+        monkeypatch.setattr("scenes.ground.terrain._PROFILES_PER_PIECE", profiles)
+        return terrain.seen(directions, pixel_angle_rad(directions), (0.0, 0.0)).share.sum(axis=0)
+
+    errors_px = [np.abs(outline_px(profiles) - outline_px(1000)) for profiles in (1, 2, 6)]
+    print([error.mean() for error in errors_px], errors_px[-1].max())
+    assert errors_px[0].mean() > 2 * errors_px[1].mean() > 4 * errors_px[2].mean()
+    assert errors_px[2].max() < 0.1
+
+
 def test_the_first_hill_in_the_way_is_seen() -> None:
     """Against a march along single rays in steps of 10 m."""
     altitude_m = 2000.0
