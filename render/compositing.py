@@ -180,17 +180,30 @@ def nearest_depth_m(depth_m: NDArray[np.float32], pixel: NDArray[np.int64]) -> N
         if not missed.size:
             break
     if missed.size:
-        empty = ~np.isfinite(depth_m)
-        if empty.all():
-            found[missed] = 0.0
-            return found
-        _, label = cv2.distanceTransformWithLabels(
-            empty.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        depth_of_label = np.zeros(int(label.max()) + 1, dtype=np.float32)
-        depth_of_label[label[~empty]] = depth_m[~empty]
-        found[missed] = depth_of_label[label.reshape(-1)[pixel[missed]]]
+        found[missed] = _depth_of_nearest(depth_m, *np.divmod(pixel[missed], width))
     return found
+
+
+def _depth_of_nearest(
+    depth_m: NDArray[np.float32], row: NDArray[np.int64], column: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """(P,) depths of what is nearest in the image to pixels that see nothing, however far away; 0 in an empty image."""
+    seen = np.isfinite(depth_m)
+    if not seen.any():
+        return np.zeros(len(row), dtype=np.float32)
+    # A window that holds all that is seen and asked for; often it is a small part of the image.
+    of_seen = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    (top, bottom), (left, right) = (
+        (min(places[0], asked.min()), max(places[-1], asked.max()) + 1)
+        for places, asked in zip(of_seen, (row, column), strict=True)
+    )
+    part, depth_m = seen[top:bottom, left:right], depth_m[top:bottom, left:right]
+    empty = (~part).astype(np.uint8)
+    _, label = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    depth_of_label = np.zeros(int(label.max()) + 1, dtype=np.float32)
+    depth_of_label[label[part]] = depth_m[part]
+    nearest: NDArray[np.float32] = depth_of_label[label[row - top, column - left]]
+    return nearest
 
 
 def amodal_counts(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
+from geometry.compiled_loops import compiled
 from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px
 from render.compositing import Compositor, TracedEye, amodal_counts
@@ -237,10 +238,8 @@ class CenterPasses:
             nearest_m = ends[..., 2].min(axis=1)
             narrow = (nearest_m > NEAREST_M) & (thickness_m * camera.fx_px < _NARROW_PX * nearest_m)
             if narrow.any():
-                first, last = np.moveaxis(self._rig.real_px(camera.project(ends[narrow]), self._eye), 1, 0)
-                column, row = _pixels_on_lines(first, last).T
-                inside = (column >= 0) & (column < self._shape[1]) & (row >= 0) & (row < self._shape[0])
-                ids[row[inside], column[inside]] = surface.part_id
+                ends_px = self._rig.real_px(camera.project(ends[narrow]), self._eye)
+                _draw_lines(np.ascontiguousarray(ends_px), int(surface.part_id), ids)
         return ids
 
     def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
@@ -311,11 +310,14 @@ class CenterPasses:
         return amodal_counts(part_id.reshape(-1)[pixel], distance_m.reshape(-1)[pixel], alone_id, alone_m)
 
 
-def _pixels_on_lines(first: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N, 2) column and row of points at most a pixel apart on lines between (E, 2) ends. [px]"""
-    steps = np.ceil(np.abs(last - first).max(axis=1)).astype(np.int64) + 1
-    line = np.repeat(np.arange(len(steps)), steps)
-    step = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
-    share = (step / np.maximum(steps[line] - 1, 1))[:, None]
-    pixels: NDArray[np.int64] = np.rint(first[line] + share * (last - first)[line]).astype(np.int64)
-    return pixels
+@compiled
+def _draw_lines(ends_px: NDArray[np.float64], part_id: int, ids: NDArray[np.uint8]) -> None:
+    """Write an id into the pixels of an (H, W) image on lines between (E, 2, 2) ends, at steps of at most a pixel."""
+    for line in range(ends_px.shape[0]):
+        u, v = ends_px[line, 0, 0], ends_px[line, 0, 1]
+        across, down = ends_px[line, 1, 0] - u, ends_px[line, 1, 1] - v
+        steps = max(int(np.ceil(max(abs(across), abs(down)))), 1)
+        for step in range(steps + 1):
+            column, row = int(np.rint(u + across * (step / steps))), int(np.rint(v + down * (step / steps)))
+            if 0 <= column < ids.shape[1] and 0 <= row < ids.shape[0]:
+                ids[row, column] = part_id

@@ -198,11 +198,12 @@ class SurfaceLight:
 
     def _around(self, row: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P,) means of the values of these rows over the centres around each."""
-        cell = self._cell_of(self.pixel[row])
-        grids = np.zeros((2, self._cells), dtype=np.float32)
-        grids[0, cell], grids[1, cell] = values, 1.0
-        kernel = (_AROUND_STEPS, _AROUND_STEPS)
-        sums, counts = (cv2.boxFilter(grid.reshape(-1, self._columns), -1, kernel).reshape(-1)[cell] for grid in grids)
+        down, right = np.divmod(self._cell_of(self.pixel[row]), self._columns)
+        # In a window with empty cells around, for most of the picture may see other things.
+        down, right = down - down.min() + _AROUND_STEPS, right - right.min() + _AROUND_STEPS
+        grids = np.zeros((2, down.max() + _AROUND_STEPS + 1, right.max() + _AROUND_STEPS + 1), dtype=np.float32)
+        grids[0, down, right], grids[1, down, right] = values, 1.0
+        sums, counts = (cv2.boxFilter(grid, -1, (_AROUND_STEPS, _AROUND_STEPS))[down, right] for grid in grids)
         mean: NDArray[np.float32] = sums / counts
         return mean
 
