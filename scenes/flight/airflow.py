@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from datasets_manifest.types.environment import MIN_AIRSPEED_M_S, Turbulence
+from geometry.compiled_loops import compiled
 from geometry.se3 import Array
 
 GUST_PERIOD_S = 0.02
@@ -115,21 +116,24 @@ def _second_order(noise: Array, period: float) -> Array:
     """
     advance = np.exp(-period) * np.array([[1 + period, period], [-period, 1 - period]])
     renew = np.linalg.cholesky(np.eye(2) - advance @ advance.T)
-    state = noise[:, 0].copy()
     out = np.empty(noise.shape[1:])
-    for k in range(len(out)):
-        if k:
-            # Written out: for matrices this small, library calls cost more than the products.
-            x, rate = state
-            first, second = noise[:, k]
-            state = np.stack(
-                [
+    _move_states(noise, advance, renew, out)
+    return out
+
+
+@compiled
+def _move_states(noise: Array, advance: Array, renew: Array, out: Array) -> None:
+    """Fill in (T, S) processes of `_second_order`, whose states move by two (2, 2) matrices."""
+    for sequence in range(out.shape[1]):
+        x, rate = noise[0, 0, sequence], noise[1, 0, sequence]
+        for k in range(out.shape[0]):
+            if k:
+                first, second = noise[0, k, sequence], noise[1, k, sequence]
+                x, rate = (
                     advance[0, 0] * x + advance[0, 1] * rate + renew[0, 0] * first,
                     advance[1, 0] * x + advance[1, 1] * rate + renew[1, 0] * first + renew[1, 1] * second,
-                ]
-            )
-        out[k] = (state[0] + np.sqrt(3.0) * state[1]) / 2
-    return out
+                )
+            out[k, sequence] = (x + np.sqrt(3.0) * rate) / 2
 
 
 def spectrum(turbulence: Dryden, airspeed_m_s: float, angular_rate_rad_s: ArrayLike) -> Array:

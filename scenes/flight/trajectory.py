@@ -142,8 +142,8 @@ class Guidance:
         self.velocity_m_s = np.zeros_like(start_m)
         self.acceleration_m_s2 = np.zeros_like(start_m)
 
-    def position_after(self, offset_s: float) -> Array:
-        """(3, S) position a fraction of a period after the last sample. [m]"""
+    def position_after(self, offset_s: float | Array) -> Array:
+        """(3, S) position a fraction of a period after the last sample, or (N, 3, S) for (N, 1, 1) of them. [m]"""
         position: Array = self.position_m + offset_s * self.velocity_m_s + offset_s**2 / 2 * self.acceleration_m_s2
         return position
 
@@ -253,17 +253,18 @@ def simulate(
     nodes, past, eyes, air = [], [], [], np.empty_like(state.nodes_m)
     bow = (hose.airspeed_m_s * inputs.body_radius_m**2 / 4, (inputs.body_radius_m / 2) ** 2)
     nose_m = inputs.nose_source_m[:, None]
+    shares = (np.arange(substeps) / substeps)[:, None, None]
     for k in range(samples):
         if inputs.follower.bandwidth_hz == 0:
             guidance.position_m = hanging_m + inputs.from_drogue_m[k]
             guidance.velocity_m_s = closing_m_s[k]
         else:
             guidance.steer(state.nodes_m[..., -1], inputs.from_drogue_m[k], closing_m_s[k])
+        # Of all steps at once: for arrays this small, calls cost more than sums.
+        gust = gusts[k] + shares * (gusts[k + 1] - gusts[k])
+        source = guidance.position_after(shares * GUST_PERIOD_S) + nose_m
         for step in range(substeps):
-            share = step / substeps
-            gust = gusts[k] + share * (gusts[k + 1] - gusts[k])
-            source = guidance.position_after(share * GUST_PERIOD_S) + nose_m
-            air_at_nodes(state.nodes_m, gust, hose.airspeed_m_s, source, bow, air)
+            air_at_nodes(state.nodes_m, gust[step], hose.airspeed_m_s, source[step], bow, air)
             if step == 0:
                 nodes.append(state.nodes_m.copy())
                 past.append(air[..., -1] - state.velocities_m_s[..., -1])
