@@ -51,6 +51,7 @@ _CREASE, _THIN, _LEAVES, _RIM, _VEIL = 0.8, 0.75, 0.55, 0.45, 0.2
 # Step between the first rays of a large picture, and how much of the way to the nearest cloud around is free of it.
 _FIRST_STEP_PX, _BEFORE_CLOUD, _ROW = 8, 0.96, 256
 # Steps between further rays, of which those are marched whose neighbours, twice as far apart, differ more than this.
+# Rays through layers without depth cost so little that fine fibres get theirs.
 _REFINEMENTS, _REFINEMENTS_THIN = ((2, 0.08), (1, 0.35)), ((1, 0.05),)
 
 
