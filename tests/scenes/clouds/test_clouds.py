@@ -312,6 +312,34 @@ def test_what_is_seen_of_a_large_picture_is_what_single_rays_see(
     assert (off > 0.35).mean(axis=(0, 1)).max() < 0.005
 
 
+def test_edges_of_dark_clouds_count_where_it_is_not_known_what_is_behind() -> None:
+    """As lamps of a town may be, below clouds by night."""
+    cloud, rays = layer(feature_size_m=900.0, thickness_m=300.0), looking(320, 240, 900.0, 25.0)
+    night = CloudLight(SIDE_LIGHT.direction, np.zeros(3), np.zeros(3), np.zeros(3))
+    alone = render_cloud_layer(cloud, rays, night).opacity
+    renderer = CloudLayerRenderer(cloud, night)
+    off = [
+        np.abs(renderer.picture(rays, bare, behind)[..., 3] - alone).mean() for behind in (None, np.zeros_like(rays))
+    ]
+    # Before black nothing is seen, so that opacities stay those of every fourth ray.
+    assert off[0] < 0.5 * off[1]
+
+
+def test_a_nearer_layer_is_seen_before_a_farther_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def picture(renderer: CloudLayerRenderer, rays: Any, through_air: Any, behind: np.ndarray) -> np.ndarray:
+        calls.append((behind.copy(), whole(renderer, rays, through_air, behind)))
+        return calls[-1][1]
+
+    whole = CloudLayerRenderer.picture
+    monkeypatch.setattr(CloudLayerRenderer, "picture", picture)
+    far = layer(kind="altocumulus", height_above_camera_m=3000.0, texture_seed=5)
+    EnvironmentRadiance(environment(clouds=(layer(), far))).radiance(looking(320, 240, 900.0, 25.0))
+    (sky, farther), (behind, _) = calls
+    np.testing.assert_allclose(behind, farther[..., :3] + (1.0 - farther[..., 3:]) * sky, rtol=1e-6)
+
+
 def test_clouds_in_dense_haze_take_few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     marched = []
 
@@ -336,7 +364,8 @@ def test_shadows_of_clouds_have_soft_edges(kind: str) -> None:
     east_m = np.arange(0.0, 6000.0, 0.5, dtype=np.float32)[None]
     share = cloud_share(layer(kind=kind, feature_size_m=900.0, thickness_m=300.0), east_m, np.zeros_like(east_m))
     assert share.min() == 0.0 and share.max() == 1.0
-    # Edges are 0.22 metres of the larger shape wide, 20 m and more here, at its mean steepness.
+    # An edge is some 20 m wide, 0.025 a step, and up to twice as steep where bodies are (0.055). A bound in place of
+    # the depth made steps of 0.4.
     assert np.abs(np.diff(share)).max() < 0.1
 
 
