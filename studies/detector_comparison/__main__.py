@@ -37,17 +37,14 @@ from studies.detector_comparison.options import (
     input_size_px,
     print_status,
 )
-from studies.detector_comparison.ultralytics_peers import (
-    PEERS,
-    YoloDetector,
+from studies.detector_comparison.peer_corpus import (
     check_corpus,
     export_corpus,
-    run_script,
     training_image_count,
     training_length,
-    yolo_environment_variables,
-    yolo_python,
 )
+from studies.detector_comparison.peer_environment import run_script, yolo_environment_variables, yolo_python
+from studies.detector_comparison.ultralytics_peers import PEERS, YoloDetector
 
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.

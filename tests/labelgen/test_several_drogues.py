@@ -22,7 +22,7 @@ from labelgen.export.annotations.yolo import write_yolo_detect
 from labelgen.export.export_log import ExportLog
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
 from labelgen.validation.dataset_checks import validate_dataset
-from studies.detector_comparison.ultralytics_peers import export_corpus
+from studies.detector_comparison.peer_corpus import export_corpus
 from tests.support.batch_datasets import FEWEST_RAYS, render_recipe
 from tests.support.recipe_builder import RIG_320_PX, recipe_text, stations
 

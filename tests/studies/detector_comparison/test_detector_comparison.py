@@ -43,13 +43,13 @@ from studies.detector_comparison.ablation import (
 )
 from studies.detector_comparison.accuracy_plot import pareto_front
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.ultralytics_peers import (
+from studies.detector_comparison.peer_corpus import (
     check_corpus,
     export_corpus,
-    run_script,
     training_image_count,
     training_length,
 )
+from studies.detector_comparison.peer_environment import run_script
 from tests.support.detector_networks import write_maps_network, write_rows_network
 
 
