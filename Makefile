@@ -87,7 +87,7 @@ bench-variety: ## how much drogues, tankers and probes differ between scenes, an
 	@$(BIN)/python -m studies.world_variety sheets --out out/world-variety
 
 CORPUS ?= out/detector/datasets/detector-small
-bench-detectors: ## detectors OURS=FILE.onnx beside five of ultralytics, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; resumes)
+bench-detectors: ## detectors OURS=FILE.onnx beside seven of other projects, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics and libreyolo; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 

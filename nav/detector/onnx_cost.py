@@ -71,5 +71,7 @@ def _products(node: Any, shapes: dict[str, list[int]], weights: dict[str, list[i
     if node.op_type == "Conv":
         # Weights are (out, in / groups, kernel...): the sum runs over all axes but the first.
         return math.prod(out) * math.prod(weight[1:])
+    if len(weight) == 1:
+        return math.prod(out) * weight[0]
     transposed = any(attribute.name == "transB" and attribute.i for attribute in node.attribute)
     return math.prod(out) * (weight[-1] if transposed else weight[-2])

@@ -1,1 +1,1 @@
-"""Our detectors beside those of ultralytics: same corpus, same image passes, same input, timed in turns."""
+"""Our detectors beside those of other projects: same corpus, same image passes, same input, timed in turns."""

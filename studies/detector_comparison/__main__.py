@@ -1,4 +1,4 @@
-"""`python -m studies.detector_comparison`: compares our detectors with those of ultralytics on the same corpus.
+"""`python -m studies.detector_comparison`: compares our detectors with those of other projects on the same corpus.
 
 Trains, exports, times and scores the detectors; a stage whose output file exists is skipped.
 """
@@ -43,8 +43,8 @@ from studies.detector_comparison.peer_corpus import (
     training_image_count,
     training_length,
 )
-from studies.detector_comparison.peer_environment import run_script, yolo_environment_variables, yolo_python
-from studies.detector_comparison.ultralytics_peers import PEERS, YoloDetector
+from studies.detector_comparison.peer_environment import peer_python, run_script, script_variables
+from studies.detector_comparison.peers import PEERS
 
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
@@ -73,7 +73,7 @@ class ComparisonOptions:
         batch: images in a step of the peers' training.
         threads: of training and timing.
         rounds: of timing.
-        device: on which the peers are trained, as ultralytics names it.
+        device: on which the peers are trained, as their projects name it.
         seed: of the peers' training.
         environment: folder of the peers' virtual environment.
         peers: which of `PEERS`.
@@ -90,7 +90,7 @@ class ComparisonOptions:
     device: str
     seed: int
     environment: Path
-    peers: tuple[str, ...] = PEERS
+    peers: tuple[str, ...] = tuple(PEERS)
 
     def __post_init__(self) -> None:
         if self.image_passes < 0 or self.batch < 1 or self.threads < 1 or self.rounds < 1:
@@ -129,12 +129,13 @@ def compare_peers(options: ComparisonOptions, out: Path, say: Say) -> dict[str, 
 
 def _compare(options: ComparisonOptions, out: Path, ours: Mapping[str, Detector], say: Say) -> dict[str, Any]:
     networks = {name: _peer_network(options, out, name, say) for name in options.peers}
-    detectors: dict[str, Detector] = {name: YoloDetector(file, options.threads) for name, file in networks.items()}
-    detectors |= ours
+    peers = {name: PEERS[name].open_detector(file, options.threads) for name, file in networks.items()}
+    detectors: dict[str, Detector] = {**peers, **ours}
     networks |= {file.stem: file for file in options.ours}
+    sizes_px = {name: peer.input_size_px for name, peer in peers.items()}
     say(f"timing {', '.join(detectors)} in turns, {options.threads} threads")
     rows = {
-        name: network_cost(file, options.size_px)._asdict() | times
+        name: network_cost(file, sizes_px.get(name, options.size_px))._asdict() | times
         for (name, file), times in zip(networks.items(), _latencies(options, detectors), strict=True)
     }
     if options.image_passes:
@@ -200,39 +201,44 @@ def _peer_network(options: ComparisonOptions, out: Path, name: str, say: Say) ->
     file = (out / f"{name}.onnx").resolve()
     if file.exists():
         return file
-    python = yolo_python(options.environment, say)
+    peer = PEERS[name]
+    python = peer_python(options.environment, say)
     folder = (out / name).resolve()
-    variables = yolo_environment_variables(out / "ultralytics", options.threads)
-    weights = f"{name}.yaml"
+    variables = script_variables(out / "ultralytics", options.threads)
+    weights = None
     if options.image_passes:
+        # Both projects choose the best epoch by the split `val`, and write it there.
         weights = str(folder / "train" / "weights" / "best.pt")
         done = folder / "trained"
         if not done.exists():
             training = _peer_training(options, out, name, folder, say)
-            run_script(python, training, folder / "train.log", variables)
+            run_script(python, peer.script, training, folder / "train.log", variables)
             write_text_atomic(done, "")
     say(f"{name}: exporting")
     part = file.with_suffix(".part.onnx")
-    export = {"do": "export", "weights": weights, "file": str(part), "size_px": options.size_px}
-    run_script(python, export, folder / "export.log", variables)
+    size_px = peer.input_size_px(options.size_px)
+    export = {"do": "export", "config": peer.config, "weights": weights, "file": str(part), "size_px": size_px}
+    run_script(python, peer.script, export, folder / "export.log", variables)
     part.replace(file)
     return file
 
 
 def _peer_training(options: ComparisonOptions, out: Path, name: str, folder: Path, say: Say) -> dict[str, Any]:
-    """The task by which `ultralytics_script` trains a peer, with the corpus exported for it."""
-    data = export_corpus(options.corpus, out / "pictures", options.size_px).resolve()
+    """The task by which a script trains a peer, with the corpus exported for it."""
+    size_px = PEERS[name].input_size_px(options.size_px)
+    pictures = "square-pictures" if PEERS[name].is_square else "pictures"
+    data = export_corpus(options.corpus, out / pictures, size_px).resolve()
     length = training_length(options.image_passes, training_image_count(options.corpus))
     passes = f"{length.epochs} epochs, {length.image_passes} image passes"
     say(f"{name}: training, {passes}; {folder / 'train.log'}")
     return {
         "do": "train",
-        "config": f"{name}.yaml",
+        "config": PEERS[name].config,
         "data": str(data),
         "folder": str(folder),
         "epochs": length.epochs,
         "fraction": length.fraction,
-        "side_px": max(options.size_px),
+        "size_px": size_px,
         "batch": options.batch,
         "threads": options.threads,
         "device": options.device,
@@ -314,7 +320,7 @@ def main(
     environment: Annotated[
         Path | None,
         typer.Option(
-            "--environment", help="Virtual environment of ultralytics, made if missing; OUT/environment by default."
+            "--environment", help="Virtual environment of the peers, made if missing; OUT/environment by default."
         ),
     ] = None,
     peer: Annotated[
@@ -322,7 +328,7 @@ def main(
         typer.Option("--peer", metavar="NAME", help=f"{', '.join(PEERS)}. Repeatable; all by default."),
     ] = None,
 ) -> None:
-    """Train networks of ultralytics from scratch, time all detectors in turns, and score them by our benchmark.
+    """Train networks of other projects from scratch, time all detectors in turns, and score them by our benchmark.
 
     With 0 image passes nothing is trained or scored: only parameters, operations and times are measured.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +32,12 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def write_accuracy_plot(rows: Mapping[str, Mapping[str, Any]], peers: Sequence[str], file: Path) -> None:
+def write_accuracy_plot(rows: Mapping[str, Mapping[str, Any]], peers: Collection[str], file: Path) -> None:
     """Draw AP and AP50 of each detector over its processor time of a pair.
 
     Args:
         rows: `ap` and `ap50` from 0 to 1, and `cpu_ms` with the median first, by the detector's name.
-        peers: names of the detectors of ultralytics.
+        peers: names of the detectors of other projects.
         file: PNG.
 
     Raises:

@@ -49,8 +49,8 @@ def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
     Args:
         corpus: a dataset.
         out: folder.
-        size_px: width and height of the images. They are made like our networks' input, because ultralytics would
-            resize them in another way.
+        size_px: width and height of the images. They are made like our networks' input, because other projects
+            would resize them in another way.
 
     Returns:
         The file `data.yaml`.
@@ -101,7 +101,7 @@ def _row(box_px: PixelBox, placement: Letterbox, size_px: tuple[int, int]) -> st
 
 
 class TrainingLength(NamedTuple):
-    """The length of a training by ultralytics.
+    """The length of a peer's training.
 
     Attributes:
         epochs: number of epochs.
@@ -117,7 +117,7 @@ class TrainingLength(NamedTuple):
 def training_length(image_passes: int, images: int) -> TrainingLength:
     """The length whose number of image passes is nearest to the given one.
 
-    ultralytics trains whole epochs, and a fraction of the images would be the same images in every epoch. So passes are
+    Peers train whole epochs, and a fraction of the images would be the same images in every epoch. So passes are
     rounded to whole epochs of all images; only a training of less than one epoch leaves images out.
 
     Raises:

@@ -2,8 +2,9 @@
 
 Run as a file, with its task as JSON on standard input.
 
-Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "side_px", "batch", "threads", "device",
-"seed"}` and `{"do": "export", "weights", "file", "size_px"}`. `weights` may be a configuration: an untrained network.
+Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "size_px", "batch", "threads", "device",
+"seed"}` and `{"do": "export", "config", "weights", "file", "size_px"}`. Without weights an untrained network is
+exported.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def train(yolo: Any, task: dict[str, Any]) -> None:
         exist_ok=True,
         epochs=epochs,
         fraction=task["fraction"],
-        imgsz=task["side_px"],
+        imgsz=max(task["size_px"]),
         batch=task["batch"],
         device=task["device"],
         seed=task["seed"],
@@ -54,12 +55,12 @@ def train(yolo: Any, task: dict[str, Any]) -> None:
 def export(yolo: Any, task: dict[str, Any]) -> None:
     """Export a network for two images to an ONNX file."""
     width, height = task["size_px"]
-    weights = task["weights"]
-    network = yolo(weights)
-    if weights.endswith(".yaml"):
+    config, weights = task["config"], task["weights"]
+    network = yolo(weights or config)
+    if weights is None:
         tasks = importlib.import_module("ultralytics.nn.tasks")
         # One class, as after a training on our corpus.
-        plain = tasks.DetectionModel(tasks.yaml_model_load(weights), ch=3, nc=1, verbose=False)
+        plain = tasks.DetectionModel(tasks.yaml_model_load(config), ch=3, nc=1, verbose=False)
         plain.args, plain.task = network.model.args, network.model.task
         network.model = plain
     made = network.export(format="onnx", imgsz=(height, width), batch=2, opset=17, simplify=False, dynamic=False)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,6 @@ from nav.detector.input_image import input_image
 from nav.detector.onnx_detector import OnnxDetector
 from nav.training.training_settings import build_settings
 from studies.detector_comparison.__main__ import (
-    PEERS,
     ComparisonOptions,
     compare_peers,
     comparison_lines,
@@ -50,6 +50,7 @@ from studies.detector_comparison.peer_corpus import (
     training_length,
 )
 from studies.detector_comparison.peer_environment import run_script
+from studies.detector_comparison.peers import PEERS
 from tests.support.detector_networks import write_maps_network, write_rows_network
 
 
@@ -181,17 +182,60 @@ def test_a_training_without_images_is_refused() -> None:
         training_length(100, 0)
 
 
-def test_an_error_of_ultralytics_names_the_log_and_its_last_line(tmp_path: Path) -> None:
-    # Our own interpreter has no ultralytics.
-    with pytest.raises(OSError, match=r"export\.log: ultralytics ended with status 1: ModuleNotFoundError"):
-        run_script(Path(sys.executable), {"do": "export"}, tmp_path / "new" / "export.log", {})
+SCRIPTS = sorted({peer.script for peer in PEERS.values()})
 
 
-def test_the_script_needs_nothing_of_ours() -> None:
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_an_error_of_a_script_names_the_log_and_its_last_line(script: Path, tmp_path: Path) -> None:
+    task = {"do": "export", "config": "d-fine-n", "weights": None, "size_px": [64, 64]}
+    # Our own interpreter has none of the projects.
+    with pytest.raises(OSError, match=rf"export\.log: {script.stem} ended with status 1: ModuleNotFoundError"):
+        run_script(Path(sys.executable), script, task, tmp_path / "new" / "export.log", {})
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_the_scripts_need_nothing_of_ours(script: Path) -> None:
     # In isolated mode with another folder as home, as in the peers' environment.
-    script = Path(run_script.__code__.co_filename).with_name("ultralytics_script.py")
-    ended = subprocess.run([sys.executable, "-I", str(script)], input="{}", capture_output=True, text=True, check=False)
-    assert "No module named 'ultralytics'" in ended.stderr
+    task = '{"do": "export", "config": "d-fine-n", "weights": null, "size_px": [64, 64]}'
+    ended = subprocess.run([sys.executable, "-I", str(script)], input=task, capture_output=True, text=True, check=False)
+    first = "torchvision" if script.stem == "libreyolo_script" else "ultralytics"
+    assert f"No module named '{first}'" in ended.stderr
+
+
+def test_every_peer_gets_its_own_task_and_pictures_of_its_input(
+    screen_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def run_nothing(python: Path, script: Path, task: dict[str, Any], log: Path, variables: dict[str, str]) -> None:
+        asked.append((script.stem, task))
+        if task["do"] == "export":
+            raise OSError("exported")
+
+    monkeypatch.setattr("studies.detector_comparison.__main__.run_script", run_nothing)
+    monkeypatch.setattr("studies.detector_comparison.__main__.peer_python", lambda folder, say: Path("python"))
+    scripts = {"yolov8n": "ultralytics_script", "d-fine-n": "libreyolo_script", "rtmdet-tiny": "libreyolo_script"}
+    for name, script in scripts.items():
+        asked.clear()
+        options = order(screen_dataset, tmp_path, image_passes=10, size_px=(96, 64), peers=(name,))
+        with pytest.raises(OSError, match="exported"):
+            compare_peers(options, tmp_path / name, lambda line: None)
+        assert [stem for stem, _ in asked] == [script] * 2
+        training, export = (task for _, task in asked)
+        size_px = (96, 96) if name == "d-fine-n" else (96, 64)
+        assert training["config"] == export["config"] == PEERS[name].config
+        assert training["size_px"] == export["size_px"] == size_px
+        # Of four images to train on ten passes are two epochs; Python rounds halves to even numbers.
+        expected = {"do": "train", "epochs": 2, "fraction": 1.0, "batch": 4, "threads": 1, "device": "cpu", "seed": 0}
+        assert {key: training[key] for key in expected} == expected
+        pictures = list((Path(training["data"]).parent / "images" / "train").iterdir())
+        assert len(pictures) == 4 and cv2.imread(str(pictures[0])).shape == (size_px[1], size_px[0], 3)
+        assert export["weights"] == str(Path(training["folder"]) / "train" / "weights" / "best.pt")
+        # What is trained already stays when the run goes on.
+        asked.clear()
+        with pytest.raises(OSError, match="exported"):
+            compare_peers(options, tmp_path / name, lambda line: None)
+        assert [task["do"] for _, task in asked] == ["export"]
 
 
 def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
@@ -281,7 +325,7 @@ def test_the_front_holds_what_no_other_beats_in_both(points: list[tuple[float, f
 @pytest.mark.slow
 def test_the_pairs_of_the_test_dataset_are_scored(screen_dataset: Path, smoke_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    for name in PEERS:
+    for name in TWO_PEERS:
         write_rows_network(out / f"{name}.onnx", np.zeros((2, 5, 2), np.float32))
     compare_peers(order(screen_dataset, tmp_path, test=smoke_dataset), out, lambda line: None)
     scored = json.loads((out / "scores.json").read_text())["dataset"]
@@ -335,7 +379,7 @@ def test_options_out_of_range_are_refused(tmp_path: Path, changes: dict[str, obj
 
 
 def test_unknown_peers_are_refused_and_all_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"--peer: must be one of yolov8s, .*, yolo26n, got yolo3, yolo4"):
+    with pytest.raises(ValueError, match=r"--peer: must be one of yolov8s, .*, rtmdet-tiny, got yolo3, yolo4"):
         order(tmp_path, tmp_path, peers=("yolo3", "yolov8n", "yolo4"))
     command = [sys.executable, "-m", "studies.detector_comparison", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
