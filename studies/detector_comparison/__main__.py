@@ -102,6 +102,10 @@ class ComparisonOptions:
             raise ValueError(f"--peer: must be one of {', '.join(PEERS)}, got {', '.join(unknown)}")
         if any(side < 32 or side % 32 for side in self.size_px):
             raise ValueError(f"size: must be multiples of 32 px, got {self.size_px[1]}x{self.size_px[0]}")
+        for name in self.peers:
+            least_px = PEERS[name].least_side_px
+            if max(PEERS[name].input_size_px(self.size_px)) < least_px:
+                raise ValueError(f"size: {name} needs {least_px} px, got {self.size_px[1]}x{self.size_px[0]}")
 
 
 def compare_peers(options: ComparisonOptions, out: Path, say: Say) -> dict[str, Any]:

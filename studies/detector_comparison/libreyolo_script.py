@@ -90,7 +90,7 @@ def export(task: dict[str, Any]) -> None:
     network, (width, height) = _NETWORKS[task["config"]], task["size_px"]
     model = open_model(network, task["weights"], "cpu")
     if network.family == "dfine":
-        model.export(format="onnx", imgsz=height, batch=2, opset=17, output_path=task["file"])
+        model.export(format="onnx", imgsz=height, batch=2, opset=17, dynamic=False, output_path=task["file"])
         return
     # libreyolo's own export of RTMDet takes squares only; its network has an output for export.
     torch = importlib.import_module("torch")

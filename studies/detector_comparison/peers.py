@@ -24,12 +24,14 @@ class Peer:
         config: its name in the script.
         open_detector: opens an exported file for a number of threads.
         is_square: its input is square, with the image in the middle.
+        least_side_px: least width of its input. [px]
     """
 
     script: Path
     config: str
     open_detector: Callable[[Path, int], PeerDetector]
     is_square: bool = False
+    least_side_px: int = 32
 
     def input_size_px(self, size_px: tuple[int, int]) -> tuple[int, int]:
         """Width and height of its input where others have `size_px`."""
@@ -41,7 +43,7 @@ PEERS: Mapping[str, Peer] = {
         name: Peer(_ULTRALYTICS, f"{name}.yaml", YoloDetector)
         for name in ("yolov8s", "yolov8n", "yolo11n", "yolo12n", "yolo26n")
     },
-    # libreyolo trains and exports D-FINE on squares only.
-    "d-fine-n": Peer(_LIBREYOLO, "d-fine-n", DfineDetector, is_square=True),
+    # libreyolo trains and exports D-FINE on squares only. Its 300 queries are chosen from cells of 16 and 32 px.
+    "d-fine-n": Peer(_LIBREYOLO, "d-fine-n", DfineDetector, is_square=True, least_side_px=256),
     "rtmdet-tiny": Peer(_LIBREYOLO, "rtmdet-tiny", RtmdetDetector),
 }

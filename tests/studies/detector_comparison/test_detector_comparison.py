@@ -217,12 +217,12 @@ def test_every_peer_gets_its_own_task_and_pictures_of_its_input(
     scripts = {"yolov8n": "ultralytics_script", "d-fine-n": "libreyolo_script", "rtmdet-tiny": "libreyolo_script"}
     for name, script in scripts.items():
         asked.clear()
-        options = order(screen_dataset, tmp_path, image_passes=10, size_px=(96, 64), peers=(name,))
+        options = order(screen_dataset, tmp_path, image_passes=10, size_px=(256, 192), peers=(name,))
         with pytest.raises(OSError, match="exported"):
             compare_peers(options, tmp_path / name, lambda line: None)
         assert [stem for stem, _ in asked] == [script] * 2
         training, export = (task for _, task in asked)
-        size_px = (96, 96) if name == "d-fine-n" else (96, 64)
+        size_px = (256, 256) if name == "d-fine-n" else (256, 192)
         assert training["config"] == export["config"] == PEERS[name].config
         assert training["size_px"] == export["size_px"] == size_px
         # Of four images to train on ten passes are two epochs; Python rounds halves to even numbers.
@@ -393,6 +393,8 @@ def test_sizes_have_their_height_first_and_are_multiples_of_32(tmp_path: Path) -
             input_size_px(text)
     with pytest.raises(ValueError, match="size: must be multiples of 32 px, got 100x64"):
         order(tmp_path, tmp_path, size_px=(64, 100))
+    with pytest.raises(ValueError, match="size: d-fine-n needs 256 px, got 192x224"):
+        order(tmp_path, tmp_path, size_px=(224, 192), peers=("yolov8n", "d-fine-n"))
 
 
 def test_tables_have_a_line_for_each_network() -> None:

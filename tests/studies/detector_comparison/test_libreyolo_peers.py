@@ -162,7 +162,7 @@ def test_exported_networks_find_the_boxes_of_their_own_project(name: str, tmp_pa
     if variable_of("libreyolo") not in os.environ:
         pytest.skip(f"{variable_of('libreyolo')} names no Python that has libreyolo")
     python, peer = Path(os.environ[variable_of("libreyolo")]), PEERS[name]
-    size_px = peer.input_size_px((96, 64))
+    size_px = peer.input_size_px((256, 192))
     data, picture = squares(tmp_path / "pictures", size_px)
     common = {"config": peer.config, "size_px": size_px}
     training: Mapping[str, Any] = common | {
