@@ -6,6 +6,7 @@ forward, left, up. ENU (the project's world): east, north, up. NED (aviation nav
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +36,16 @@ def read_only(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
         array = np.array(values, dtype=np.float64)
     except TypeError as error:
         raise ValueError(f"{name}: must hold numbers only") from error
-    if array.ndim != len(shape) or any(want not in (-1, got) for want, got in zip(shape, array.shape, strict=True)):
+    if array.shape != shape and not _fits(array.shape, shape):
         raise ValueError(f"{name}: must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: must be finite, got {array.tolist()}")
     array.flags.writeable = False
     return array
+
+
+def _fits(got: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    return len(got) == len(wanted) and all(want in (-1, have) for want, have in zip(wanted, got, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +62,7 @@ class RigidTransform:
 
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, (3, 3), "rotation")
-        # Larger numbers are not cosines and could overflow in the product.
-        fits = np.abs(rotation).max() < _MAX_COSINE
-        fits = fits and np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ORTHONORMAL_TOLERANCE
-        if not fits or np.linalg.det(rotation) < 0:
+        if not _is_rotation(*rotation.tolist()):
             raise ValueError(f"rotation: must be orthonormal with determinant +1, got {rotation.tolist()}")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation_m", read_only(self.translation_m, (3,), "translation_m"))
@@ -102,6 +104,23 @@ class RigidTransform:
         # Not a BLAS product: its rounding would depend on how many rows and threads there are.
         result: Array = np.einsum("ij,...j->...i", self.rotation, np.asarray(vectors, dtype=np.float64))
         return result
+
+
+def _is_rotation(first: list[float], second: list[float], third: list[float]) -> bool:
+    """Whether three rows are orthonormal and right-handed: for nine numbers, numpy takes several times as long."""
+    # Larger numbers are not cosines and could overflow in the products.
+    if not max(map(abs, (*first, *second, *third))) < _MAX_COSINE:
+        return False
+    lengths = abs(_dot(first, first) - 1), abs(_dot(second, second) - 1), abs(_dot(third, third) - 1)
+    slants = abs(_dot(first, second)), abs(_dot(first, third)), abs(_dot(second, third))
+    if max(*lengths, *slants) > _ORTHONORMAL_TOLERANCE:
+        return False
+    (a, b, c), (d, e, f) = first, second
+    return _dot([b * f - c * e, c * d - a * f, a * e - b * d], third) > 0
+
+
+def _dot(one: list[float], other: list[float]) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def exp_twist(twist: ArrayLike) -> RigidTransform:
@@ -177,14 +196,17 @@ _SMALL_RAD = 1e-4
 
 
 def exp_rotation(vector_rad: Array) -> Array:
-    """(3, 3) rotation of a (3,) rotation vector, `I + [a]x J(a)` with the left Jacobian. [rad]"""
-    matrix: Array = np.eye(3) + skew(vector_rad) @ left_jacobian(vector_rad)
-    return matrix
+    """(3, 3) rotation of a (3,) rotation vector, by Rodrigues' formula. [rad]"""
+    angle = math.hypot(*vector_rad.tolist())
+    if angle < _SMALL_RAD:
+        return _identity_and_cross(vector_rad, 1 - angle**2 / 6, 0.5 - angle**2 / 24)
+    return _identity_and_cross(vector_rad, math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2)
 
 
 def log_rotation(rotation: Array) -> Array:
     """(3,) rotation vector of a (3, 3) rotation, at most pi long. [rad]"""
-    vector: Array = Rotation.from_matrix(rotation).as_rotvec()
+    # To check the matrix would take three times as long as the rest.
+    vector: Array = Rotation.from_matrix(rotation, assume_valid=True).as_rotvec()
     return vector
 
 
@@ -193,14 +215,19 @@ def left_jacobian(vector_rad: Array) -> Array:
 
     Source: T. D. Barfoot, State Estimation for Robotics, 2017, eq. 7.77, doi:10.1017/9781316671528.
     """
-    angle = float(np.linalg.norm(vector_rad))
-    cross = skew(vector_rad)
+    angle = math.hypot(*vector_rad.tolist())
     if angle < _SMALL_RAD:
-        first, second = 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
-    else:
-        first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    jacobian: Array = np.eye(3) + first * cross + second * cross @ cross
-    return jacobian
+        return _identity_and_cross(vector_rad, 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120)
+    return _identity_and_cross(vector_rad, (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3)
+
+
+def _identity_and_cross(vector: Array, first: float, second: float) -> Array:
+    """(3, 3) `I + first [a]x + second [a]x [a]x` of a (3,) vector."""
+    x, y, z = vector.tolist()
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    xx, yy, zz = second * x * x, second * y * y, second * z * z
+    x, y, z = first * x, first * y, first * z
+    return np.array([[1 - yy - zz, xy - z, xz + y], [xy + z, 1 - xx - zz, yz - x], [xz - y, yz + x, 1 - xx - yy]])
 
 
 FRD_FROM_OPTICAL = RigidTransform(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))

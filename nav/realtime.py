@@ -19,11 +19,12 @@ from threading import Condition
 from time import monotonic
 from typing import Generic, Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.storage.pair_faults import unreadable_reason
-from drogue_models.marker_layout import marker_layout
+from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
 from nav.centroids.annuli import fit_annuli
@@ -31,10 +32,14 @@ from nav.centroids.blurred_edges import blurred_step
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
+from nav.matching.marker_channel import Blobs
+from nav.matching.ring_matching import match_ring
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
 from nav.pose.marker_geometry import project_markers
 from nav.sequence_navigator import MeasuredPair, PairEstimates, SequenceNavigator, SkippedPair
+from nav.tracking.pose_predict import learn_constellation
+from nav.tracking.region import EyeImage
 
 _RADII_PX = 12.0, 8.0
 _SIDE_PX, _MIDDLE_PX = 40, 20.0
@@ -44,7 +49,7 @@ _DISTANCE_M = 5.0
 
 @cache
 def warm_up_jit() -> None:
-    """Run the compiled loops once: fit a drawn disc and a drawn annulus in each eye, and a pose.
+    """Run the compiled loops once: fit a drawn disc and a drawn annulus in each eye, and find, follow and place a ring.
 
     The loops take seconds to compile at their first use on a machine, and tenths of a second to load in every later
     process. In real time, pairs that arrive meanwhile would be late.
@@ -53,6 +58,22 @@ def warm_up_jit() -> None:
     rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
     pixels = project_markers(rig, layout, np.eye(3)[None], np.array([[0.1, 0.1, _DISTANCE_M]]))
     solve_one(stack_features(rig, layout, pixels, np.eye(2)), np.ones(pixels.shape[1:3], dtype=bool))
+    radius_px = rig.camera.fx_px * layout.radius_m / _DISTANCE_M
+    _find_and_follow(Blobs(pixels[0, 0], np.full(layout.count, np.pi * radius_px**2)), layout)
+
+
+def _find_and_follow(markers: Blobs, layout: MarkerLayout) -> None:
+    match_ring(markers, layout)
+    low_px, high_px = markers.centers_px.min(axis=0), markers.centers_px.max(axis=0)
+    x_px, y_px = (low_px - markers.radii_px.max()).tolist()
+    side_px = float((high_px - low_px).max() + 2 * markers.radii_px.max())
+    picture = np.zeros((int(y_px + 2 * side_px), int(x_px + 2 * side_px)), np.uint8)
+    for center_px, marker_px in zip(markers.centers_px, markers.radii_px, strict=True):
+        cv2.circle(picture, np.rint(center_px).astype(int).tolist(), round(marker_px), (255,), cv2.FILLED)
+    image, box = EyeImage(picture, 0.0), (x_px, y_px, side_px, side_px)
+    constellation = learn_constellation(image, box)
+    if constellation is not None:
+        constellation.find(image, box, _MIDDLE_PX)
 
 
 def _fit_edges() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from nav.matching.marker_channel import Blobs
+from nav.numerics.compiled import compiled
 
 # Blurring and thresholds change a disc's apparent radius by less than this factor at 5 px of diameter.
 _SIZE_FACTOR = 1.6
@@ -27,6 +28,7 @@ _FIT_TOLERANCE = 0.4
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
+_VOTE_DECIMALS = 3
 # Four numbers in each row of the map of markers at several depths, and one marker to spare.
 _LEAST_FOR_LEAN = 5
 FEW = 4  # markers are enough where the ring is predicted or another image shows the same ones
@@ -36,7 +38,6 @@ _REACH = 1.4
 _MOST_OFF = 3.0
 # A complete ring this close to its map ends the search.
 _GOOD_RMS_FRACTION = 0.1
-_CHUNK = 2048
 # Another order of the markers is as good where its distances from the map are at most this many times as large, and
 # another one where it moves a marker by more than this many radii.
 _AS_GOOD, _ELSEWHERE = 2.0, 1.0
@@ -202,24 +203,51 @@ def _complex(points: Array) -> NDArray[np.complex128]:
 def _best_guesses(blobs: Blobs, layout: MarkerLayout) -> list[tuple[complex, complex]]:
     """Similarity maps `z -> turn z + shift` that carry the most markers onto blobs, from all pairs of blobs."""
     turns, shifts = _pair_guesses(blobs, layout)
-    places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
-    sizes = blobs.radii_px.astype(np.float32)
-    votes = np.zeros(len(turns))
-    for start in range(0, len(turns), _CHUNK):
-        turn, shift = turns[start : start + _CHUNK, None], shifts[start : start + _CHUNK, None]
-        guess = turn * places + shift
-        gap_x = guess.real.astype(np.float32)[:, :, None] - image.real.astype(np.float32)
-        gap_y = guess.imag.astype(np.float32)[:, :, None] - image.imag.astype(np.float32)
-        radius = (layout.radius_m * np.abs(turn)).astype(np.float32)
-        fits = (sizes < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * sizes)
-        nearest = np.sqrt(
-            (gap_x**2 + gap_y**2 + np.where(fits, np.float32(0), np.float32(np.inf))[:, None]).min(axis=2)
-        )
-        nearness = np.maximum(0, 1 - nearest / (_GUESS_TOLERANCE * radius))
-        # A matched marker counts one, and its closeness breaks ties.
-        votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) / 2
-    order = np.argsort(-votes, kind="stable")[:_REFINED_GUESSES]
+    places_m = np.ascontiguousarray(layout.centers_m[:, :2])
+    votes = _count_votes(turns, shifts, places_m, blobs.centers_px, blobs.radii_px, layout.radius_m)
+    # Maps that are equal but for rounding stay in the order of their pairs, which mixes the orders of the markers.
+    order = np.argsort(-votes.round(_VOTE_DECIMALS), kind="stable")[:_REFINED_GUESSES]
     return [(complex(turns[i]), complex(shifts[i])) for i in order if votes[i] >= 3]
+
+
+@compiled
+def _count_votes(
+    turns: NDArray[np.complex128],
+    shifts: NDArray[np.complex128],
+    places_m: Array,
+    centers_px: Array,
+    radii_px: Array,
+    radius_m: float,
+) -> Array:
+    """(G,) for each map, how many markers lie near a blob of their size; their mean nearness breaks ties.
+
+    Args:
+        turns, shifts: (G,) of the maps, see `_best_guesses`.
+        places_m: (N, 2) places of the markers in the rim plane. [m]
+        centers_px: (M, 2) centres of the blobs. [px]
+        radii_px: (M,) their radii. [px]
+        radius_m: of a marker. [m]
+    """
+    votes = np.zeros(len(turns))
+    for guess in range(len(turns)):
+        turn, shift = turns[guess], shifts[guess]
+        radius_px = radius_m * abs(turn)
+        tolerance_px = _GUESS_TOLERANCE * radius_px
+        nearness_sum = 0.0
+        for marker in range(len(places_m)):
+            x_px = turn.real * places_m[marker, 0] - turn.imag * places_m[marker, 1] + shift.real
+            y_px = turn.imag * places_m[marker, 0] + turn.real * places_m[marker, 1] + shift.imag
+            nearest_px2 = tolerance_px**2
+            for blob in range(len(centers_px)):
+                size_px = radii_px[blob]
+                if size_px < _SIZE_FACTOR * radius_px and radius_px < _SIZE_FACTOR * size_px:
+                    gap_px2 = (x_px - centers_px[blob, 0]) ** 2 + (y_px - centers_px[blob, 1]) ** 2
+                    nearest_px2 = min(nearest_px2, gap_px2)
+            if nearest_px2 < tolerance_px**2:
+                votes[guess] += 1.0
+                nearness_sum += 1 - np.sqrt(nearest_px2) / tolerance_px
+        votes[guess] += nearness_sum / len(places_m) / 2
+    return votes
 
 
 def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:

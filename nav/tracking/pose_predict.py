@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from geometry.se3 import Array
 from nav.detector.detector import Detection
 from nav.matching.marker_channel import Blobs, disc_like_blobs
+from nav.numerics.compiled import compiled
 from nav.tracking.box_motion import BoxMotion
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_center, box_size, expand_box, image_region, move_box
 
@@ -44,7 +45,7 @@ class MarkerConstellation:
     """Positions of a drogue's bright spots in its box.
 
     Attributes:
-        plane: index of the plane in `_color_planes` that shows them.
+        plane: number of the plane that shows them, see `_color_plane`.
         places: (S, 2) from the box's centre. [box sides]
         radius: of each. [box sides]
     """
@@ -70,7 +71,7 @@ class MarkerConstellation:
         if region is None:
             return None
         best: tuple[Box, float] | None = None
-        for blobs in _spots(_color_planes(region.pixels)[self.plane]):
+        for blobs in _spots(_color_plane(region.pixels, self.plane)):
             found = self._match(region, blobs, box)
             if found is not None and (best is None or found[1] > best[1]):
                 best = found
@@ -103,17 +104,43 @@ class MarkerConstellation:
     def _best_match(self, spots: Array, box: Box, tolerance_px: float) -> tuple[Array, float, int]:
         """Shift, scale and number of matches of the best hypothesis; each aligns one position with one spot."""
         best: tuple[Array, float, int] = np.zeros(2), 1.0, -1
-        nearest = np.inf
+        nearest_px = np.inf
         for scale in _SCALES:
-            places = box_center(box) + scale * self.places * np.array(box[2:])
-            shifts = (spots[:, None] - places).reshape(-1, 2)
-            gaps = np.linalg.norm((places + shifts[:, None])[:, :, None] - spots, axis=3).min(axis=2)
-            counts = (gaps < tolerance_px).sum(axis=1)
-            error = np.minimum(gaps, tolerance_px).sum(axis=1)
-            index = int(np.lexsort((error, -counts))[0])
-            if (int(counts[index]), -float(error[index])) > (best[2], -nearest):
-                best, nearest = (shifts[index], scale, int(counts[index])), float(error[index])
+            places_px = box_center(box) + scale * self.places * np.array(box[2:])
+            shift_px, matches, error_px = _best_shift(places_px, spots, tolerance_px)
+            if (matches, -error_px) > (best[2], -nearest_px):
+                best, nearest_px = (shift_px, scale, matches), error_px
         return best
+
+
+@compiled
+def _best_shift(places_px: Array, spots_px: Array, tolerance_px: float) -> tuple[Array, int, float]:
+    """The shift from one place to one spot that brings most places near a spot, of equals with the smallest error.
+
+    Args:
+        places_px: (P, 2). [px]
+        spots_px: (S, 2). [px]
+        tolerance_px: nearer ones match. [px]
+
+    Returns:
+        (2,) shift [px], number of matches, and the sum of distances, each at most the tolerance [px].
+    """
+    shift_px, most, least_px = np.zeros(2), -1, np.inf
+    for spot in range(len(spots_px)):
+        for place in range(len(places_px)):
+            x_px, y_px = spots_px[spot, 0] - places_px[place, 0], spots_px[spot, 1] - places_px[place, 1]
+            matches, error_px = 0, 0.0
+            for moved in range(len(places_px)):
+                gap_px2 = tolerance_px**2
+                for other in range(len(spots_px)):
+                    across_px = places_px[moved, 0] + x_px - spots_px[other, 0]
+                    down_px = places_px[moved, 1] + y_px - spots_px[other, 1]
+                    gap_px2 = min(gap_px2, across_px**2 + down_px**2)
+                matches += gap_px2 < tolerance_px**2
+                error_px += np.sqrt(gap_px2)
+            if matches > most or (matches == most and error_px < least_px):
+                shift_px[0], shift_px[1], most, least_px = x_px, y_px, matches, error_px
+    return shift_px, most, least_px
 
 
 def learn_constellation(image: EyeImage, box: Box) -> MarkerConstellation | None:
@@ -122,8 +149,8 @@ def learn_constellation(image: EyeImage, box: Box) -> MarkerConstellation | None
     if region is None:
         return None
     best: MarkerConstellation | None = None
-    for plane, plane_image in enumerate(_color_planes(region.pixels)):
-        for blobs in _spots(plane_image):
+    for plane in range(_plane_count(region.pixels)):
+        for blobs in _spots(_color_plane(region.pixels, plane)):
             places = (region.to_image(blobs.centers_px) - box_center(box)) / box[2:]
             radii = blobs.radii_px * float(np.sqrt(region.step_px.prod())) / box_size(box)
             for radius in radii:
@@ -139,14 +166,24 @@ def _step_px(image: EyeImage, box: Box) -> float:
     return max(1.0, box_size(box) / (_GRID if image.pixels.ndim == 3 else _GREY_GRID))
 
 
-def _color_planes(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Images in which markers may stand out: each colour minus the larger other one, and the smallest of the three."""
+_PLANES = 4
+# Index of a colour and of the two that are subtracted from it.
+_OTHER_COLORS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
+
+
+def _plane_count(pixels: NDArray[np.uint8]) -> int:
+    return 1 if pixels.shape[2] == 1 else _PLANES
+
+
+def _color_plane(pixels: NDArray[np.uint8], plane: int) -> NDArray[np.uint8]:
+    """An image in which markers may stand out: a colour minus the larger other one, or the smallest of the three."""
     if pixels.shape[2] == 1:
-        return [pixels[:, :, 0]]
-    red, green, blue = cv2.split(pixels)
-    pairs = ((red, green, blue), (green, red, blue), (blue, red, green))
-    differences = [np.asarray(cv2.subtract(own, cv2.max(one, other)), dtype=np.uint8) for own, one, other in pairs]
-    return [*differences, np.asarray(cv2.min(cv2.min(red, green), blue), dtype=np.uint8)]
+        return pixels[:, :, 0]
+    colors = cv2.split(pixels)
+    if plane == len(_OTHER_COLORS):
+        return np.asarray(cv2.min(cv2.min(colors[0], colors[1]), colors[2]), dtype=np.uint8)
+    own, one, other = _OTHER_COLORS[plane]
+    return np.asarray(cv2.subtract(colors[own], cv2.max(colors[one], colors[other])), dtype=np.uint8)
 
 
 def _spots(plane_image: NDArray[np.uint8]) -> Iterator[Blobs]:

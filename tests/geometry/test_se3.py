@@ -3,12 +3,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from geometry.se3 import (
     RigidTransform,
     angles_from_axis,
     angles_from_rotation,
+    exp_rotation,
     exp_twist,
+    left_jacobian,
+    log_rotation,
     log_twist,
     rotation_from_angles,
     skew,
@@ -69,6 +73,29 @@ def test_log_is_the_inverse_of_exp(angle_rad: float) -> None:
         twist = sample_twist(rng, angle_rad)
         # Near half a turn the logarithm is ill-conditioned by 1 / (pi - angle), here 1e3.
         np.testing.assert_allclose(log_twist(exp_twist(twist)), twist, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle_rad", ANGLES_RAD)
+def test_rotations_of_vectors_are_those_of_scipy(angle_rad: float) -> None:
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        vector = sample_twist(rng, angle_rad)[3:]
+        rotation = exp_rotation(vector)
+        np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(log_rotation(rotation), vector, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle_rad", ANGLES_RAD)
+def test_the_left_jacobian_is_the_derivative_of_the_rotation(angle_rad: float) -> None:
+    rng = np.random.default_rng(13)
+    step_rad = 1e-5
+    for _ in range(20):
+        vector, along = sample_twist(rng, angle_rad)[3:], rng.normal(size=3)
+        ends = (Rotation.from_rotvec(vector + sign * step_rad * along) for sign in (1, -1))
+        ahead, behind = (end * Rotation.from_rotvec(vector).inv() for end in ends)
+        slope = (ahead.as_rotvec() - behind.as_rotvec()) / (2 * step_rad)
+        # Central differences err by the third derivative, of order one, times the square of the step, and by rounding.
+        np.testing.assert_allclose(left_jacobian(vector) @ along, slope, rtol=0, atol=1e-8)
 
 
 def test_exp_follows_the_twist_to_second_order() -> None:
@@ -153,6 +180,9 @@ def test_arrays_are_copies_and_read_only() -> None:
     [
         (np.diag([1.0, 1.0, -1.0]), np.zeros(3), "rotation: must be orthonormal"),
         (np.eye(3) * 1.01, np.zeros(3), "rotation: must be orthonormal"),
+        (np.array([[1, 2e-6, 0], [0, 1, 0], [0, 0, 1]]), np.zeros(3), "rotation: must be orthonormal"),
+        (np.full((3, 3), 1e200), np.zeros(3), "rotation: must be orthonormal"),
+        (np.zeros((3, 3)), np.zeros(3), "rotation: must be orthonormal"),
         (np.eye(2), np.zeros(3), "rotation: must have shape"),
         (np.eye(3), np.zeros(2), "translation_m: must have shape"),
         (np.eye(3), [0.0, np.nan, 0.0], "translation_m: must be finite"),

@@ -9,14 +9,17 @@ from typing import Any
 import pytest
 
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
+from nav.matching import ring_matching
 from nav.numerics import levenberg_marquardt
 from nav.pose import adjustment_loops
+from nav.tracking import pose_predict
 
 
 def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile() -> None:
     code = """
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
+from nav.matching import ring_matching
 from nav.numerics import levenberg_marquardt
 from nav.realtime import warm_up_jit
 from nav.pair_navigator import PairNavigator
@@ -26,7 +29,7 @@ from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels)
+    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels, ring_matching)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -49,7 +52,15 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
 
 @pytest.mark.parametrize(
     "loops",
-    [adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels],
+    [
+        adjustment_loops,
+        blurred_edges,
+        centroid_uncertainty,
+        levenberg_marquardt,
+        outline_pixels,
+        pose_predict,
+        ring_matching,
+    ],
 )
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops: Any) -> None:
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]
