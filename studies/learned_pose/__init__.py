@@ -1,0 +1,1 @@
+"""Learned keypoints beside the project's own poses, on the same frames."""

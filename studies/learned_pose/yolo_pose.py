@@ -1,0 +1,189 @@
+"""YOLO26n-pose of ultralytics: its training on crops of our renders, and its keypoints in crops.
+
+The environment, training and export are those of the detector comparison. One class, the drogue, and as many keypoints
+as the ring has markers, clockwise from the top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.atomic import new_folder, write_text_atomic
+from datasets_manifest.storage.image_codecs import encode_png
+from datasets_manifest.storage.manifest import SplitName
+from geometry.se3 import Array
+from nav.detector.input_image import network_input
+from studies.detector_comparison.ultralytics_peers import (
+    open_session,
+    run_script,
+    training_image_count,
+    training_length,
+    yolo_environment_variables,
+    yolo_python,
+)
+from studies.learned_pose.keypoint_corpus import EyeSample, split_samples
+from studies.learned_pose.keypoint_crops import (
+    CROP_PX,
+    CropView,
+    build_crop,
+    crop_from_patch,
+    image_from_crop,
+    inverse_affine,
+    map_points,
+)
+from studies.learned_pose.ring_keypoints import clockwise_from_top
+
+NAME = "yolo26n-pose"
+_SPLITS: tuple[SplitName, ...] = ("train", "val")
+# Every keypoint is labelled and visible, in the format of COCO.
+_VISIBLE = 2
+# Rows of the network: two corners, score, class, then x, y and score of every keypoint.
+_BOX_COLUMNS, _SCORE_COLUMN, _KEYPOINT_COLUMNS = 6, 4, 3
+# A best row with a lower score is no drogue; the crops all show one.
+_LEAST_SCORE = 0.05
+
+
+@dataclass(frozen=True)
+class YoloTraining:
+    """Options of the training.
+
+    Attributes:
+        image_passes: rounded to whole epochs.
+        batch: images in a step.
+        threads: that it may use.
+        seed: of the training.
+        environment: folder of ultralytics' virtual environment.
+    """
+
+    image_passes: int
+    batch: int
+    threads: int
+    seed: int
+    environment: Path
+
+
+def mirrored_keypoints(count: int) -> list[int]:
+    """For each keypoint clockwise from the top, the one that it becomes in a mirrored image."""
+    return list(range(count))[::-1]
+
+
+def label_row(sample: EyeSample) -> str:
+    """Class, box and keypoints of a crop as fractions of its size, as ultralytics reads them."""
+    # Corner coordinates: the low corner of the first pixel is 0.
+    keypoints = (map_points(crop_from_patch(CropView()), sample.markers_px) + 0.5) / CROP_PX
+    keypoints = keypoints[clockwise_from_top(keypoints)]
+    x, y, width, height = sample.true_box_xywh_px
+    crop_from_image = inverse_affine(image_from_crop(sample.patch, CropView()))
+    low, high = map_points(crop_from_image, np.array([[x, y], [x + width, y + height]])) + 0.5
+    box = np.concatenate([(low + high) / 2, high - low]) / CROP_PX
+    values = [*box.tolist(), *(value for point in keypoints.tolist() for value in (*point, _VISIBLE))]
+    return f"0 {' '.join(map(repr, values))}\n"
+
+
+def export_crops(corpus: Path, out: Path) -> Path:
+    """Write crops and labels, unless they exist already.
+
+    Returns:
+        The file `data.yaml`.
+
+    Raises:
+        ValueError: the corpus cannot be read, or a split is empty.
+        OSError: the folder cannot be written; no partial folder is left.
+    """
+    data = out / "data.yaml"
+    if data.exists():
+        return data
+    with new_folder(out) as folder:
+        count = 0
+        for split in _SPLITS:
+            for kind in ("images", "labels"):
+                (folder / kind / split).mkdir(parents=True)
+            samples = 0
+            for sample in split_samples(corpus, split):
+                name, samples, count = (
+                    f"{split}/{sample.frame_index:06d}_{sample.eye}",
+                    samples + 1,
+                    len(sample.markers_px),
+                )
+                crop = build_crop(sample.patch.pixels, CropView())
+                (folder / "images" / f"{name}.png").write_bytes(encode_png(crop))
+                (folder / "labels" / f"{name}.txt").write_text(label_row(sample), encoding="utf-8")
+            if not samples:
+                raise ValueError(f"{corpus}: has no pairs in the split {split}")
+        lines = "".join(f"{split}: images/{split}\n" for split in _SPLITS)
+        lines += f"kpt_shape: [{count}, 3]\nflip_idx: {mirrored_keypoints(count)}\nnames:\n  0: drogue\n"
+        (folder / "data.yaml").write_text(f'path: ""\n{lines}', encoding="utf-8")
+    return data
+
+
+def train_yolo(corpus: Path, out: Path, training: YoloTraining, say: Callable[[str], None]) -> Path:
+    """The trained network as an ONNX file for two crops; a stage whose output exists is skipped.
+
+    Raises:
+        ValueError: the corpus cannot be read.
+        OSError: the environment cannot be made, or the training or the export failed; the message names the log.
+    """
+    file = (out / f"{NAME}.onnx").resolve()
+    if file.exists():
+        return file
+    python = yolo_python(training.environment, say)
+    folder = (out / NAME).resolve()
+    variables = yolo_environment_variables(out / "ultralytics", training.threads)
+    done = folder / "trained"
+    if not done.exists():
+        data = export_crops(corpus, out / "crops").resolve()
+        length = training_length(training.image_passes, training_image_count(corpus))
+        say(f"{NAME}: {length.epochs} epochs, {length.image_passes} image passes; {folder / 'train.log'}")
+        task = {
+            "do": "train",
+            "config": f"{NAME}.yaml",
+            "data": str(data),
+            "folder": str(folder),
+            "epochs": length.epochs,
+            "fraction": length.fraction,
+            "side_px": CROP_PX,
+            "batch": training.batch,
+            "threads": training.threads,
+            "device": "cpu",
+            "seed": training.seed,
+        }
+        run_script(python, task, folder / "train.log", variables)
+        write_text_atomic(done, "")
+    part = file.with_suffix(".part.onnx")
+    weights = str(folder / "train" / "weights" / "best.pt")
+    export = {"do": "export", "weights": weights, "file": str(part), "size_px": (CROP_PX, CROP_PX)}
+    run_script(python, export, folder / "export.log", variables)
+    part.replace(file)
+    return file
+
+
+class YoloPose:
+    """Runs the network on the crops of both eyes."""
+
+    def __init__(self, file: Path, threads: int) -> None:
+        """Open a network of two crops.
+
+        Raises:
+            ValueError: the file is missing or not an ONNX network; the message names it.
+        """
+        self._session = open_session(file, threads)
+        self._input_name = self._session.get_inputs()[0].name
+
+    def keypoints(self, crops: Sequence[NDArray[np.uint8]]) -> list[Array | None]:
+        """Keypoints (N, 2) in pixel-centre coordinates of each of two crops, None where no drogue is found. [px]"""
+        (output,) = self._session.run(None, {self._input_name: network_input(crops)})
+        return [best_keypoints(rows) for rows in output]
+
+
+def best_keypoints(rows: NDArray[np.float32]) -> Array | None:
+    """Keypoints (N, 2) of the best row of (R, 6 + 3 N), in pixel-centre coordinates, or None without a drogue. [px]"""
+    best = rows[int(np.argmax(rows[:, _SCORE_COLUMN]))].astype(np.float64)
+    if best[_SCORE_COLUMN] < _LEAST_SCORE:
+        return None
+    points: Array = best[_BOX_COLUMNS:].reshape(-1, _KEYPOINT_COLUMNS)[:, :2] - 0.5
+    return points
