@@ -117,6 +117,7 @@ def test_tables_have_median_and_95th_percentile() -> None:
 def test_missing_poses_do_not_lower_a_percentile() -> None:
     assert percentile([1.0, 2.0, math.inf, math.inf], 50) == 2.0
     assert percentile([1.0, math.inf, math.inf, math.inf], 50) == math.inf
+    assert percentile([*range(1, 10), math.inf], 95) == math.inf and percentile(range(1, 11), 95) == 10
 
 
 def test_bins_take_their_lower_edge() -> None:
