@@ -42,9 +42,9 @@ NAME = "yolo26n-pose"
 _SPLITS: tuple[SplitName, ...] = ("train", "val")
 # Every keypoint is labelled and visible, in the format of COCO.
 _VISIBLE = 2
-# Rows of the network: two corners, score, class, then x, y and score of every keypoint.
-_BOX_COLUMNS, _SCORE_COLUMN, _KEYPOINT_COLUMNS = 6, 4, 3
-# A best row with a lower score is no drogue; the crops all show one.
+# Channels of the network: box, score, then x, y and score of every keypoint.
+_SCORE_CHANNEL, _FIRST_KEYPOINT, _KEYPOINT_CHANNELS = 4, 5, 3
+# A best cell with a lower score is no drogue; the crops all show one.
 _LEAST_SCORE = 0.05
 
 
@@ -169,21 +169,30 @@ class YoloPose:
         """Open a network of two crops.
 
         Raises:
-            ValueError: the file is missing or not an ONNX network; the message names it.
+            ValueError: the file is missing, or not a network of two crops with one class; the message names it.
         """
         self._session = open_session(file, threads)
-        self._input_name = self._session.get_inputs()[0].name
+        (entry,), (output,) = self._session.get_inputs(), self._session.get_outputs()
+        self._input_name = entry.name
+        _, channels, cells = output.shape if len(output.shape) == 3 else (0, 0, 0)
+        # Networks of ultralytics with their own suppression of doubles have another, transposed output.
+        if not cells > channels > _FIRST_KEYPOINT or (channels - _FIRST_KEYPOINT) % _KEYPOINT_CHANNELS:
+            raise ValueError(f"{file}: must give a box, a score and keypoints in each cell, got {output.shape}")
 
     def keypoints(self, crops: Sequence[NDArray[np.uint8]]) -> list[Array | None]:
         """Keypoints (N, 2) in pixel-centre coordinates of each of two crops, None where no drogue is found. [px]"""
         (output,) = self._session.run(None, {self._input_name: network_input(crops)})
-        return [best_keypoints(rows) for rows in output]
+        return [best_keypoints(answer) for answer in output]
 
 
-def best_keypoints(rows: NDArray[np.float32]) -> Array | None:
-    """Keypoints (N, 2) of the best row of (R, 6 + 3 N), in pixel-centre coordinates, or None without a drogue. [px]"""
-    best = rows[int(np.argmax(rows[:, _SCORE_COLUMN]))].astype(np.float64)
-    if best[_SCORE_COLUMN] < _LEAST_SCORE:
+def best_keypoints(answer: NDArray[np.float32]) -> Array | None:
+    """Keypoints (N, 2) of the best cell in pixel-centre coordinates, or None without a drogue. [px]
+
+    Args:
+        answer: (5 + 3 N, cells) of one crop, in corner coordinates. [px]
+    """
+    best = answer[:, int(np.argmax(answer[_SCORE_CHANNEL]))].astype(np.float64)
+    if best[_SCORE_CHANNEL] < _LEAST_SCORE:
         return None
-    points: Array = best[_BOX_COLUMNS:].reshape(-1, _KEYPOINT_COLUMNS)[:, :2] - 0.5
+    points: Array = best[_FIRST_KEYPOINT:].reshape(-1, _KEYPOINT_CHANNELS)[:, :2] - 0.5
     return points

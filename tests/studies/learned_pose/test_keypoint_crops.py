@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ from studies.learned_pose.keypoint_crops import (
     sample_view,
 )
 from studies.learned_pose.simcc import CROP_PX as SIMCC_PX
-from studies.learned_pose.yolo_pose import best_keypoints, label_row, mirrored_keypoints
+from studies.learned_pose.yolo_pose import YoloPose, best_keypoints, label_row, mirrored_keypoints
+from tests.support.detector_networks import write_rows_network
 
 VIEWS = [CropView(), *(sample_view(np.random.default_rng(seed)) for seed in range(6))]
 
@@ -99,10 +101,10 @@ def test_labels_are_read_back_as_the_points_of_the_crop() -> None:
     keypoints = np.array(numbers[4:]).reshape(8, 3)
     assert (keypoints[:, 2] == 2).all()
     # A network that answers with the label in pixels gives the markers back.
-    rows = np.zeros((2, 6 + 24), np.float32)
-    rows[1, 4] = 0.9
-    rows[1, 6:] = (keypoints * [CROP_PX, CROP_PX, 1]).ravel()
-    found = best_keypoints(rows)
+    answer = np.zeros((5 + 24, 1344), np.float32)
+    answer[4, [7, 900]] = 0.5, 0.9
+    answer[5:, 900] = (keypoints * [CROP_PX, CROP_PX, 1]).ravel()
+    found = best_keypoints(answer)
     assert found is not None
     expected = map_points(crop_from_patch(CropView()), one.markers_px)
     gaps = np.linalg.norm(found[:, None] - expected, axis=2)
@@ -116,7 +118,20 @@ def test_labels_are_read_back_as_the_points_of_the_crop() -> None:
 
 
 def test_no_drogue_is_no_keypoints() -> None:
-    assert best_keypoints(np.zeros((3, 30), np.float32)) is None
+    assert best_keypoints(np.zeros((29, 1344), np.float32)) is None
+
+
+def test_a_network_with_another_output_is_refused(tmp_path: Path) -> None:
+    # That of a detector without keypoints, and that of a network which suppresses doubles itself.
+    for shape in ((2, 5, 30), (2, 300, 30)):
+        file = write_rows_network(tmp_path / "other.onnx", np.zeros(shape, np.float32))
+        with pytest.raises(ValueError, match="must give a box, a score and keypoints in each cell"):
+            YoloPose(file, 1)
+    answer = np.zeros((2, 29, 40), np.float32)
+    answer[0, 4, 3], answer[0, 5:, 3] = 0.7, 40
+    network = YoloPose(write_rows_network(tmp_path / "pose.onnx", answer, (CROP_PX, CROP_PX)), 1)
+    left, right = network.keypoints([np.zeros((CROP_PX, CROP_PX, 3), np.uint8)] * 2)
+    assert left is not None and (left == 39.5).all() and left.shape == (8, 2) and right is None
 
 
 def test_a_mirrored_picture_has_the_mirrored_keypoints() -> None:
