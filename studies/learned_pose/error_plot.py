@@ -49,11 +49,13 @@ def write_error_plot(pairs: Sequence[PairScores], file: Path) -> None:
         dots = [(pair.distance_m, 100 * score.position_m) for pair in pairs for score in pair.scores[name]]
         # A pose without error has no place on a logarithmic axis, nor has one that is missing.
         shown = [(x, y) for x, y in dots if 0 < y < math.inf]
-        axes.scatter([x for x, _ in shown], [y for _, y in shown], s=5, color=color, alpha=0.25, linewidths=0)
+        axes.scatter([x for x, _ in shown], [y for _, y in shown], s=5, color=color, alpha=0.35, linewidths=0)
         medians = [
             percentile([100 * s.position_m for pair in group for s in pair.scores[name]], 50) for group in groups
         ]
-        axes.plot(middles_m, medians, color=color, marker=marker, markersize=5, linewidth=1.6, label=name)
+        axes.plot(
+            middles_m, medians, color=color, marker=marker, markersize=5, linewidth=1.6, label=name.replace("`", "")
+        )
     bounds = [percentile([100 * pair.bound_m for pair in group], 50) for group in groups]
     axes.plot(middles_m, bounds, "--", color=_BOUND, linewidth=1.4, label="stereo bound")
     axes.set_xscale("log")
