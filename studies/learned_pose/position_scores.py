@@ -23,7 +23,7 @@ _NO_POSE = "none"
 
 
 @dataclass(frozen=True)
-class PoseScore:
+class PoseDeviation:
     """One pose against the truth; both errors are infinite where there is no pose.
 
     Attributes:
@@ -47,7 +47,7 @@ class PairScores:
 
     distance_m: float
     bound_m: float
-    scores: Mapping[str, tuple[PoseScore, ...]]
+    scores: Mapping[str, tuple[PoseDeviation, ...]]
 
 
 def stereo_bound_m(record: PairRecord) -> float:
@@ -71,13 +71,13 @@ def stereo_bound_m(record: PairRecord) -> float:
     return float(np.sqrt(np.trace(covariance[:3, :3])))
 
 
-def score_pose(pose: RigidTransform | None, truth: RigidTransform) -> PoseScore:
+def score_pose(pose: RigidTransform | None, truth: RigidTransform) -> PoseDeviation:
     """Errors of one pose; roll does not count."""
     if pose is None:
-        return PoseScore(math.inf, math.inf)
+        return PoseDeviation(math.inf, math.inf)
     sine = np.linalg.norm(np.cross(pose.rotation[:, 2], truth.rotation[:, 2]))
     cosine = pose.rotation[:, 2] @ truth.rotation[:, 2]
-    return PoseScore(pose_error(pose, truth).position_m, float(np.rad2deg(np.arctan2(sine, cosine))))
+    return PoseDeviation(pose_error(pose, truth).position_m, float(np.rad2deg(np.arctan2(sine, cosine))))
 
 
 def score_pair(record: PairRecord, poses: Mapping[str, Poses]) -> PairScores:

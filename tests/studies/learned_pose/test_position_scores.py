@@ -22,7 +22,7 @@ from studies.learned_pose import position_scores
 from studies.learned_pose.error_plot import PLOTTED, write_error_plot
 from studies.learned_pose.position_scores import (
     PairScores,
-    PoseScore,
+    PoseDeviation,
     in_bin,
     missing_lines,
     percentile,
@@ -90,17 +90,17 @@ def test_roll_does_not_count_and_no_pose_is_infinitely_wrong() -> None:
     assert score.position_m == pytest.approx(0.05) and score.axis_deg < 1e-5
     tilted = RigidTransform(rotation_from_angles(0.1 + np.radians(2), 0.2, 0.0), truth.translation_m)
     assert score_pose(tilted, truth).axis_deg == pytest.approx(2, abs=1e-9)
-    assert score_pose(None, truth) == PoseScore(math.inf, math.inf)
+    assert score_pose(None, truth) == PoseDeviation(math.inf, math.inf)
 
 
 def pairs() -> list[PairScores]:
     """Twenty pairs at 6 m and one at 25 m; `a` has errors of 1 to 20 mm, `b` misses every tenth pose."""
     near = []
     for k in range(1, 21):
-        missing = PoseScore(math.inf, math.inf)
-        scores = {"a": (PoseScore(0.001 * k, 0.1),), "b": (PoseScore(0.5, 1.0) if k % 10 else missing,)}
+        missing = PoseDeviation(math.inf, math.inf)
+        scores = {"a": (PoseDeviation(0.001 * k, 0.1),), "b": (PoseDeviation(0.5, 1.0) if k % 10 else missing,)}
         near.append(PairScores(6.0, 0.002, scores))
-    return [*near, PairScores(25.0, 0.01, {"a": (PoseScore(0.2, 0.5),), "b": (PoseScore(0.4, 2.0),)})]
+    return [*near, PairScores(25.0, 0.01, {"a": (PoseDeviation(0.2, 0.5),), "b": (PoseDeviation(0.4, 2.0),)})]
 
 
 def test_tables_have_median_and_95th_percentile() -> None:
@@ -126,7 +126,7 @@ def test_bins_take_their_lower_edge() -> None:
 
 
 def test_the_plot_is_drawn_with_missing_poses(tmp_path: Path) -> None:
-    two = (PoseScore(0.01, 0.1), PoseScore(math.inf, math.inf))
+    two = (PoseDeviation(0.01, 0.1), PoseDeviation(math.inf, math.inf))
     some = [PairScores(z, 1e-4 * z, dict.fromkeys(PLOTTED, two)) for z in (3.0, 7.0, 15.0, 25.0, 35.0)]
     write_error_plot(some, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
