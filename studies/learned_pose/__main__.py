@@ -75,6 +75,7 @@ def compare(options: StudyOptions, out: Path) -> list[PairScores]:
         ValueError: a dataset that cannot be read, or a folder of another study.
         OSError: a training failed, or a file cannot be written.
     """
+    check_folder(options, out)
     for name in ("train", "test"):
         source = load_recipe(str(_HERE / f"{name}.toml"))
         print_status(f"{name}: {source.recipe.frames.count} pairs")
@@ -93,6 +94,27 @@ def compare(options: StudyOptions, out: Path) -> list[PairScores]:
         pairs.append(score_all(test.record(index), test.images(index), sources["YOLO26n-pose"], sources["SimCC"]))
     write_text_atomic(out / "errors.json", json.dumps([asdict(pair) for pair in pairs], indent=1) + "\n")
     return pairs
+
+
+def check_folder(options: StudyOptions, out: Path) -> None:
+    """Record the trainings in a new folder, and refuse one with other trainings.
+
+    Raises:
+        ValueError: the folder has networks of other options.
+    """
+    yolo, simcc = options.yolo, options.simcc
+    trainings = {
+        "yolo": {"image_passes": yolo.image_passes, "batch": yolo.batch, "seed": yolo.seed},
+        "simcc": {"image_passes": simcc.image_passes, "batch": simcc.batch, "seed": simcc.seed},
+    }
+    file = out / "trainings.json"
+    if file.exists():
+        before = json.loads(file.read_text(encoding="utf-8"))
+        if before != trainings:
+            raise ValueError(f"{out}: holds other trainings, {before}; name a new folder")
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    write_text_atomic(file, json.dumps(trainings, indent=1) + "\n")
 
 
 def score_all(record: PairRecord, images: StereoImages, yolo: KeypointSource, simcc: KeypointSource) -> PairScores:
@@ -119,7 +141,7 @@ def hashes(out: Path) -> Mapping[str, str]:
 def main(
     out: Annotated[Path, typer.Option("--out", help="Folder; a stopped run goes on in it.")] = Path("out/learned-pose"),
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
-    yolo_passes: Annotated[int, typer.Option("--yolo-passes", min=1, help="Crops that YOLO26n-pose sees.")] = 8000,
+    yolo_passes: Annotated[int, typer.Option("--yolo-passes", min=1, help="Crops that YOLO26n-pose sees.")] = 14_400,
     simcc_passes: Annotated[int, typer.Option("--simcc-passes", min=1, help="Crops that SimCC sees.")] = 40_000,
     threads: ThreadsOption = 1,
     seed: SeedOption = 0,

@@ -14,13 +14,13 @@ from datasets_manifest.recipe.recipe import Recipe
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from droguekit.api.stereo_dataset import StereoDataset
 from geometry.se3 import Array
-from studies.learned_pose.__main__ import score_all
+from studies.learned_pose.__main__ import StudyOptions, check_folder, score_all
 from studies.learned_pose.estimators import ESTIMATORS, OURS, SIMCC, SIMCC_STEREO, YOLO, KeypointSource
 from studies.learned_pose.keypoint_corpus import KeypointCorpus, eye_sample, keypoint_sigma_px, load_corpus
 from studies.learned_pose.keypoint_crops import PATCH_PX, CropView, crop_from_patch, map_points
 from studies.learned_pose.keypoint_training import SimccTraining, train_simcc, training_batch
 from studies.learned_pose.ring_keypoints import clockwise_from_top
-from studies.learned_pose.yolo_pose import export_crops
+from studies.learned_pose.yolo_pose import YoloTraining, export_crops
 
 STUDY = Path(__file__).parents[3] / "studies" / "learned_pose"
 SMALL_RIG = {"preset": "rgb-ideal", "width_px": 640, "height_px": 480, "focal_px": 1066.7}
@@ -104,6 +104,18 @@ def test_another_training_does_not_go_on(tmp_path: Path, monkeypatch: pytest.Mon
         train_simcc(drawn_corpus, tmp_path, replace(training, seed=1), silent)
     with pytest.raises(ValueError, match="training: numbers must be positive"):
         SimccTraining(image_passes=0)
+
+
+def test_a_folder_keeps_its_trainings(tmp_path: Path) -> None:
+    yolo = YoloTraining(image_passes=100, batch=16, threads=1, seed=0, environment=tmp_path)
+    options = StudyOptions(1, yolo, SimccTraining(image_passes=200))
+    check_folder(options, tmp_path / "out")
+    # Workers and threads do not count.
+    check_folder(StudyOptions(2, replace(yolo, threads=2), options.simcc), tmp_path / "out")
+    with pytest.raises(ValueError, match="holds other trainings"):
+        check_folder(replace(options, yolo=replace(yolo, image_passes=101)), tmp_path / "out")
+    with pytest.raises(ValueError, match="holds other trainings"):
+        check_folder(replace(options, simcc=replace(options.simcc, seed=1)), tmp_path / "out")
 
 
 def test_the_rate_rises_and_falls_to_zero() -> None:
