@@ -10,7 +10,7 @@ from studies.detector_comparison.libreyolo_peers import DfineDetector, RtmdetDet
 from studies.detector_comparison.peer_detector import PeerDetector
 from studies.detector_comparison.ultralytics_peers import YoloDetector
 
-_ULTRALYTICS, _LIBREYOLO = (
+ULTRALYTICS_SCRIPT, LIBREYOLO_SCRIPT = (
     Path(__file__).with_name(f"{package}_script.py") for package in ("ultralytics", "libreyolo")
 )
 
@@ -40,10 +40,10 @@ class Peer:
 
 PEERS: Mapping[str, Peer] = {
     **{
-        name: Peer(_ULTRALYTICS, f"{name}.yaml", YoloDetector)
+        name: Peer(ULTRALYTICS_SCRIPT, f"{name}.yaml", YoloDetector)
         for name in ("yolov8s", "yolov8n", "yolo11n", "yolo12n", "yolo26n")
     },
     # libreyolo trains and exports D-FINE on squares only. Its 300 queries are chosen from cells of 16 and 32 px.
-    "d-fine-n": Peer(_LIBREYOLO, "d-fine-n", DfineDetector, is_square=True, least_side_px=256),
-    "rtmdet-tiny": Peer(_LIBREYOLO, "rtmdet-tiny", RtmdetDetector),
+    "d-fine-n": Peer(LIBREYOLO_SCRIPT, "d-fine-n", DfineDetector, is_square=True, least_side_px=256),
+    "rtmdet-tiny": Peer(LIBREYOLO_SCRIPT, "rtmdet-tiny", RtmdetDetector),
 }

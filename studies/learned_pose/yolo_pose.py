@@ -18,14 +18,10 @@ from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import SplitName
 from geometry.se3 import Array
 from nav.detector.input_image import network_input
-from studies.detector_comparison.ultralytics_peers import (
-    open_session,
-    run_script,
-    training_image_count,
-    training_length,
-    yolo_environment_variables,
-    yolo_python,
-)
+from studies.detector_comparison.peer_corpus import training_image_count, training_length
+from studies.detector_comparison.peer_detector import open_session
+from studies.detector_comparison.peer_environment import peer_python, run_script, script_variables
+from studies.detector_comparison.peers import ULTRALYTICS_SCRIPT
 from studies.learned_pose.keypoint_corpus import EyeSample, split_samples
 from studies.learned_pose.keypoint_crops import (
     CROP_PX,
@@ -131,9 +127,9 @@ def train_yolo(corpus: Path, out: Path, training: YoloTraining, say: Callable[[s
     file = (out / f"{NAME}.onnx").resolve()
     if file.exists():
         return file
-    python = yolo_python(training.environment, say)
+    python = peer_python(training.environment, say)
     folder = (out / NAME).resolve()
-    variables = yolo_environment_variables(out / "ultralytics", training.threads)
+    variables = script_variables(out / "ultralytics", training.threads)
     done = folder / "trained"
     if not done.exists():
         data = export_crops(corpus, out / "crops").resolve()
@@ -146,18 +142,19 @@ def train_yolo(corpus: Path, out: Path, training: YoloTraining, say: Callable[[s
             "folder": str(folder),
             "epochs": length.epochs,
             "fraction": length.fraction,
-            "side_px": CROP_PX,
+            "size_px": (CROP_PX, CROP_PX),
             "batch": training.batch,
             "threads": training.threads,
             "device": "cpu",
             "seed": training.seed,
         }
-        run_script(python, task, folder / "train.log", variables)
+        run_script(python, ULTRALYTICS_SCRIPT, task, folder / "train.log", variables)
         write_text_atomic(done, "")
     part = file.with_suffix(".part.onnx")
     weights = str(folder / "train" / "weights" / "best.pt")
-    export = {"do": "export", "weights": weights, "file": str(part), "size_px": (CROP_PX, CROP_PX)}
-    run_script(python, export, folder / "export.log", variables)
+    size_px = (CROP_PX, CROP_PX)
+    export = {"do": "export", "config": f"{NAME}.yaml", "weights": weights, "file": str(part), "size_px": size_px}
+    run_script(python, ULTRALYTICS_SCRIPT, export, folder / "export.log", variables)
     part.replace(file)
     return file
 
