@@ -25,6 +25,8 @@ class ModelMetadata:
         score_threshold: a box with a lower score is not a drogue.
         large_from_px: boxes whose longer side in the input is at least this come from a second pass at half the size;
             0 for a single pass. [px]
+        small_below_px: boxes whose longer side in the input is below this are looked at again at twice the scale, see
+            `nav.detector.coarse_to_fine`; 0 for never. [px]
         classes: exactly one name.
         licence: of the weights.
         manifest_sha256: of the dataset that it was trained on; empty for a dataset not made by droguekit, and for
@@ -36,6 +38,7 @@ class ModelMetadata:
     input_size_px: tuple[int, int] = (640, 480)
     score_threshold: float = 0.5
     large_from_px: float = 0.0
+    small_below_px: float = 0.0
     classes: tuple[str, ...] = ("drogue",)
     licence: str = ""
     manifest_sha256: str = ""
@@ -51,8 +54,10 @@ class ModelMetadata:
         # In Python a bool is an int.
         if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
-        if type(self.large_from_px) not in (int, float) or not 0 <= self.large_from_px <= MAX_SIDE_PX:
-            raise ValueError(f"large_from_px: must be 0 to {MAX_SIDE_PX}, got {self.large_from_px!r}")
+        for name in ("large_from_px", "small_below_px"):
+            side = getattr(self, name)
+            if type(side) not in (int, float) or not 0 <= side <= MAX_SIDE_PX:
+                raise ValueError(f"{name}: must be 0 to {MAX_SIDE_PX}, got {side!r}")
         if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
             raise ValueError(f"classes: must be one name, got {self.classes!r}")
         for name, kind in (("licence", str), ("manifest_sha256", str), ("network", Mapping), ("training", Mapping)):

@@ -17,8 +17,9 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 from datasets_manifest.types.images import StereoImages
 from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.stereo import EYES, Eye
+from nav.detector.coarse_to_fine import FINE_SCALE, LEAST_CANDIDATE, WINDOW_PX, detect_again
 from nav.detector.detector import Detection, StereoDetection
-from nav.detector.input_image import input_image, letterbox, letterbox_image, network_input
+from nav.detector.input_image import Letterbox, input_image, letterbox, letterbox_image, network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, pass_sizes
 from nav.detector.output_maps import MAP_CHANNELS, MAX_SIDE_PX, SIZE_STEP_PX, STRIDES
@@ -75,6 +76,11 @@ class OnnxDetector:
             raise ValueError(
                 f"{file}: large_from_px: takes {fixed_size[0]}x{fixed_size[1]} px only, and not half of it"
             )
+        if fixed_size and self.metadata.small_below_px:
+            raise ValueError(
+                f"{file}: small_below_px: takes {fixed_size[0]}x{fixed_size[1]} px only, and no windows of "
+                f"{WINDOW_PX}x{WINDOW_PX} px"
+            )
         self._fixed_size = fixed_size
         self.pass_sizes_px = self._pass_sizes(self.input_size_px)
         probe = fixed_size or (SIZE_STEP_PX, 2 * SIZE_STEP_PX)
@@ -82,12 +88,12 @@ class OnnxDetector:
 
     def detect(self, images: StereoImages) -> StereoDetection:
         """The best box in each image, if it reaches the score threshold of the file."""
-        found = self._candidates(images, self.metadata.score_threshold, max_boxes=1)
+        found = self._candidates(images, EYES, self.metadata.score_threshold, max_boxes=1)
         return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        return self._candidates(images, least_score, _MOST_BOXES)
+        return self._candidates(images, EYES, least_score, _MOST_BOXES)
 
     def candidates_in_picture(self, picture: NDArray[np.uint8], least_score: float) -> tuple[Detection, ...]:
         """The boxes of a single picture (H, W, 3) or (H, W), the best first, sought at its own size.
@@ -96,15 +102,12 @@ class OnnxDetector:
         enlarged to their size: small drogues need their pixels.
         """
         height, width = picture.shape[:2]
-        image, placement = letterbox_image(picture, self._fixed_size or self._picture_size(width, height))
+        size = self._fixed_size or self._picture_size(width, height)
+        image, placement = letterbox_image(picture, size)
+        fine = letterbox_image(picture, _fine_size(size))[0] if self._looks_again(size) else image
         # A network whose batch is fixed takes both eyes.
-        ((boxes, scores), *_) = self._detect([image] * self._least_batch, least_score, _MOST_BOXES)
-        return tuple(
-            Detection((x, y, box_width, box_height), score)
-            for (x, y, box_width, box_height), score in zip(
-                placement.to_image(boxes).tolist(), scores.tolist(), strict=True
-            )
-        )
+        (found, *_) = self._detect([image] * self._least_batch, [fine] * self._least_batch, least_score, _MOST_BOXES)
+        return _placed(found, placement)
 
     def _picture_size(self, width: int, height: int) -> tuple[int, int]:
         widest, most = max(self.input_size_px), min(_MOST_ENLARGED_INPUT * max(self.input_size_px), MAX_SIDE_PX)
@@ -116,32 +119,54 @@ class OnnxDetector:
     def _pass_sizes(self, size_px: tuple[int, int]) -> tuple[tuple[int, int], ...]:
         return pass_sizes(size_px, self.metadata.input_size_px) if self.metadata.large_from_px else (size_px,)
 
-    def _candidates(self, images: StereoImages, least_score: float, max_boxes: int) -> dict[Eye, tuple[Detection, ...]]:
-        inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
-        candidates: dict[Eye, tuple[Detection, ...]] = {}
-        for eye, placement, (boxes, scores) in zip(
-            EYES, placements, self._detect(inputs, least_score, max_boxes), strict=True
-        ):
-            candidates[eye] = tuple(
-                Detection((x, y, width, height), score)
-                for (x, y, width, height), score in zip(
-                    placement.to_image(boxes).tolist(), scores.tolist(), strict=True
-                )
-            )
-        return candidates
+    def _candidates(
+        self, images: StereoImages, eyes: Sequence[Eye], least_score: float, max_boxes: int
+    ) -> dict[Eye, tuple[Detection, ...]]:
+        """The boxes in the images of some eyes, which pass through the network together."""
+        inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in eyes), strict=True)
+        fine = inputs
+        if self._looks_again(self.input_size_px):
+            fine = tuple(input_image(images, eye, _fine_size(self.input_size_px))[0] for eye in eyes)
+        found = self._detect(inputs, fine, least_score, max_boxes)
+        return {eye: _placed(some, placement) for eye, some, placement in zip(eyes, found, placements, strict=True)}
 
-    def _detect(self, inputs: Sequence[NDArray[np.uint8]], least_score: float, max_boxes: int) -> list[ScoredBoxes]:
-        """For each image the boxes in corner coordinates of the input, and their scores."""
+    def _detect(
+        self,
+        inputs: Sequence[NDArray[np.uint8]],
+        fine: Sequence[NDArray[np.uint8]],
+        least_score: float,
+        max_boxes: int,
+    ) -> list[ScoredBoxes]:
+        """For each image the boxes in corner coordinates of the input, and their scores.
+
+        Args:
+            inputs: of the network.
+            fine: the same images at twice the scale, where these are looked at.
+            least_score: boxes with a lower score are left out.
+            max_boxes: largest number of boxes of an image.
+        """
         height, width = inputs[0].shape[:2]
         passes = len(self._pass_sizes((width, height)))
-        return detect_multiscale(
-            inputs,
-            lambda batch: self._run(network_input(batch)),
-            self.metadata.large_from_px,
-            least_score,
-            max_boxes,
-            passes,
-        )
+        large_from_px, small_below_px = self.metadata.large_from_px, self.metadata.small_below_px
+        if not self._looks_again((width, height)):
+            return detect_multiscale(inputs, self._run_images, large_from_px, least_score, max_boxes, passes)
+        least = min(least_score, LEAST_CANDIDATE)
+        found = detect_multiscale(inputs, self._run_images, large_from_px, least, _MOST_BOXES, passes)
+        threshold = self.metadata.score_threshold
+        return detect_again(found, fine, self._run_in_pairs, small_below_px, threshold, least_score, max_boxes)
+
+    def _looks_again(self, size_px: tuple[int, int]) -> bool:
+        """Whether small boxes in inputs of a width and height are looked at again; very large inputs show enough."""
+        return self.metadata.small_below_px > 0 and max(_fine_size(size_px)) <= MAX_SIDE_PX
+
+    def _run_images(self, images: Sequence[NDArray[np.uint8]]) -> list[NDArray[Any]]:
+        return self._run(network_input(images))
+
+    def _run_in_pairs(self, images: Sequence[NDArray[np.uint8]]) -> list[NDArray[Any]]:
+        """The maps of any number of images of one size: two a batch, as networks with a fixed batch take them."""
+        pairs = [images[start : start + len(EYES)] for start in range(0, len(images), len(EYES))]
+        maps = [self._run_images([*pair, *pair][: len(EYES)]) for pair in pairs]
+        return [np.concatenate(each)[: len(images)] for each in zip(*maps, strict=True)]
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:
@@ -157,6 +182,20 @@ class OnnxDetector:
             raise ValueError(
                 f"{self._file}: outputs must be maps of numbers {want}, got {got}; see docs/reference/detectors.md"
             )
+
+
+def _fine_size(input_size_px: tuple[int, int]) -> tuple[int, int]:
+    width, height = input_size_px
+    return FINE_SCALE * width, FINE_SCALE * height
+
+
+def _placed(found: ScoredBoxes, placement: Letterbox) -> tuple[Detection, ...]:
+    """Boxes and scores in an input as detections in its image."""
+    boxes, scores = found
+    return tuple(
+        Detection((x, y, width, height), score)
+        for (x, y, width, height), score in zip(placement.to_image(boxes).tolist(), scores.tolist(), strict=True)
+    )
 
 
 def _open_session(file: Path, threads: int) -> tuple[onnxruntime.InferenceSession, int]:

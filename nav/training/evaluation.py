@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from datasets_manifest.storage.manifest import SplitName
 from geometry.boxes import intersection_over_union
+from nav.detector.coarse_to_fine import FINE_SCALE, detect_again
 from nav.detector.input_image import PADDING_DN
 from nav.detector.multiscale_inference import detect_multiscale
 from nav.training.augmentation import Boxes, Image, paint_view, whole_view
@@ -30,6 +31,9 @@ from nav.training.corpus import Corpus
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_settings import SizePx
 from nav.training.training_state import ComputeDevice
+
+DEFAULT_THRESHOLD = 0.5
+"""Score threshold where nothing was measured."""
 
 MAX_BOXES = 10
 """Number of predictions of an image that are scored, the best first."""
@@ -111,6 +115,7 @@ def predict(
     large_from_px: float,
     compute: ComputeDevice,
     advance: Callable[[], None] = lambda: None,
+    small_below_px: float = 0.0,
 ) -> Predictions:
     """Run a network on the images of both eyes of a split, without augmentation.
 
@@ -124,23 +129,31 @@ def predict(
             detector; 0 for a single pass.
         compute: device and precision.
         advance: called after each batch.
+        small_below_px: boxes whose longer side is below this are looked at again at twice the scale, as in the
+            detector; 0 for never.
     """
     members = [(int(pair), eye) for pair in corpus.split(split) for eye in (0, 1)]
     groups = [members[start : start + batch_images] for start in range(0, len(members), batch_images)]
     truth: list[Boxes] = []
     found: list[tuple[Boxes, Boxes]] = []
 
-    def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
-        return [whole_image(corpus, pair, eye, size_px) for pair, eye in group]
+    def read(group: Sequence[tuple[int, int]], scale: int = 1) -> list[tuple[Image, Boxes]]:
+        height_px, width_px = size_px
+        return [whole_image(corpus, pair, eye, (scale * height_px, scale * width_px)) for pair, eye in group]
 
     def run(images: Sequence[Image]) -> list[NDArray[Any]]:
         with torch.inference_mode(), compute.autocast():
             maps = network(to_tensor(np.stack(images), compute))
         return [each.float().cpu().numpy() for each in maps]
 
-    for group in prefetch_map(read, groups, threads=1, ahead=2):
-        found += detect_multiscale([image for image, _ in group], run, large_from_px, _MIN_SCORE, MAX_BOXES)
-        truth += [boxes for _, boxes in group]
+    for group, whole in zip(groups, prefetch_map(read, groups, threads=1, ahead=2), strict=True):
+        images, boxes = zip(*whole, strict=True)
+        some = detect_multiscale(images, run, large_from_px, _MIN_SCORE, MAX_BOXES)
+        if small_below_px:
+            fine = [image for image, _ in read(group, FINE_SCALE)]
+            some = detect_again(some, fine, run, small_below_px, DEFAULT_THRESHOLD, _MIN_SCORE, MAX_BOXES)
+        found += some
+        truth += boxes
         advance()
     return Predictions(truth, found)
 

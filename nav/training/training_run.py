@@ -18,6 +18,7 @@ from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.network import DetectorNetwork
 from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
+    DEFAULT_THRESHOLD,
     Predictions,
     ValidationScores,
     average_precision,
@@ -51,7 +52,6 @@ from nav.training.training_state import (
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
 _LOCK_FILE = ".lock"
-_DEFAULT_THRESHOLD = 0.5
 _NO_CPU_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 
 
@@ -208,12 +208,13 @@ def _evaluate_and_export(
         measure_batch_statistics(each, corpus, size, exact)
 
     def predictions(split: SplitName, of: DetectorNetwork = network) -> Predictions:
-        return predict(of, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
+        batch, large, small = settings.batch_images, settings.large_from_px, settings.small_below_px
+        return predict(of, corpus, split, size, batch, large, exact, small_below_px=small)
 
     validation, test = predictions("val"), predictions("test")
     last_validation = predictions("val", state.average.network)
     threshold, last_threshold = (
-        best_threshold(each.truth, each.found, _DEFAULT_THRESHOLD) for each in (validation, last_validation)
+        best_threshold(each.truth, each.found, DEFAULT_THRESHOLD) for each in (validation, last_validation)
     )
     result = TrainingResult(
         out / ONNX_FILE,
@@ -244,6 +245,7 @@ def _metadata(
         input_size_px=(width_px, height_px),
         score_threshold=result.score_threshold,
         large_from_px=settings.large_from_px,
+        small_below_px=settings.small_below_px,
         licence=settings.licence,
         manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.caches) == 1 else "",
         network=network.config.to_dict(),

@@ -18,7 +18,15 @@ SizePx = tuple[int, int]
 
 # They may differ when a training is resumed: they change its device or speed, the last bits of floats, or the exported
 # file's metadata, but not what is trained.
-_FREE_TO_CHANGE = ("device", "threads", "loader_workers", "checkpoint_minutes", "large_from_px", "licence")
+_FREE_TO_CHANGE = (
+    "device",
+    "threads",
+    "loader_workers",
+    "checkpoint_minutes",
+    "large_from_px",
+    "small_below_px",
+    "licence",
+)
 
 
 class TrainingSettings(FrozenModel):
@@ -59,6 +67,7 @@ class TrainingSettings(FrozenModel):
         checkpoint_minutes: longest time between two checkpoints; the end of every epoch is one too. [min]
         large_from_px: the exported detector takes boxes whose longer side in the input is at least this from a second
             pass at half the size; 0 for a single pass. [px]
+        small_below_px: it looks again, at twice the scale, at boxes whose longer side is below this; 0 for never. [px]
         start_sha256: hash of the file of weights that the training starts from, set by `settings_from_start`; empty
             for random weights.
         licence: of the weights, stored in the exported files, such as an SPDX identifier; empty if not stated.
@@ -99,6 +108,7 @@ class TrainingSettings(FrozenModel):
     loader_workers: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
     large_from_px: float = Field(default=160.0, ge=0, le=MAX_SIDE_PX)
+    small_below_px: float = Field(default=0.0, ge=0, le=MAX_SIDE_PX)
     start_sha256: str = Field(default="", pattern="^([0-9a-f]{64})?$", exclude_if=lambda digest: not digest)
     licence: str = Field(default="", max_length=100)
 

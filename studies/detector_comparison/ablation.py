@@ -19,7 +19,6 @@ from droguekit.scoring.detection.detection_truth import ImageTruth, read_detecti
 from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, Detector, StereoDetection
-from nav.detector.input_image import input_image
 from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector
 from studies.detector_comparison.latency import measure_latency
@@ -47,17 +46,7 @@ class SingleViewDetector(OnnxDetector):
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        candidates: dict[Eye, tuple[Detection, ...]] = {}
-        for eye in EYES:
-            image, placement = input_image(images, eye, self.input_size_px)
-            ((boxes, scores),) = self._detect([image], least_score, max_boxes=20)
-            candidates[eye] = tuple(
-                Detection((x, y, width, height), score)
-                for (x, y, width, height), score in zip(
-                    placement.to_image(boxes).tolist(), scores.tolist(), strict=True
-                )
-            )
-        return candidates
+        return {eye: self._candidates(images, (eye,), least_score, max_boxes=20)[eye] for eye in EYES}
 
 
 ONE_VIEW = "one-view"

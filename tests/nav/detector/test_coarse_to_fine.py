@@ -1,0 +1,148 @@
+"""Small boxes are looked at again, in windows at twice the scale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from datasets_manifest.types.images import StereoImages
+from geometry.se3 import Array
+from nav.detector.coarse_to_fine import FINE_SCALE, WINDOW_PX, detect_again, window_corners
+from nav.detector.model_metadata import ModelMetadata
+from nav.detector.onnx_detector import OnnxDetector
+from nav.detector.output_maps import MAP_CHANNELS, STRIDES
+from tests.support.detector_networks import write_red_squares
+
+SMALL_PX, THRESHOLD = 80.0, 0.5
+FINE = np.zeros((960, 1280, 3), np.uint8)
+
+
+def boxes_of(*rows: tuple[float, float, float, float]) -> tuple[Array, Array]:
+    """Square boxes and scores of rows x, y, side, score."""
+    return np.array([[x, y, side, side] for x, y, side, _ in rows]).reshape(-1, 4), np.array([row[3] for row in rows])
+
+
+def answers(*rows: tuple[int, int, float, float]) -> list[NDArray[np.float32]]:
+    """Output maps of one image that hold one box for each row: column and row of a cell of 8 px, side [px], score."""
+    maps = [np.full((1, MAP_CHANNELS, WINDOW_PX // stride, WINDOW_PX // stride), -9, np.float32) for stride in STRIDES]
+    for column, row, side_px, score in rows:
+        maps[0][0, 0, row, column] = np.log(score / (1 - score))
+        maps[0][0, 1:, row, column] = np.log(side_px / 2 / STRIDES[0])
+    return maps
+
+
+def again(
+    coarse: tuple[Array, Array], *windows: list[NDArray[np.float32]], least_score: float = 0.05
+) -> tuple[Array, Array, list[NDArray[np.uint8]]]:
+    """What is found in one image whose windows have these output maps; and the windows that were looked at."""
+    seen: list[NDArray[np.uint8]] = []
+
+    def run(images: Sequence[NDArray[np.uint8]]) -> Sequence[NDArray[Any]]:
+        seen.extend(images)
+        return [np.concatenate(each) for each in zip(*windows[: len(images)], strict=True)]
+
+    ((boxes, scores),) = detect_again([coarse], [FINE], run, SMALL_PX, THRESHOLD, least_score, 20)
+    return boxes, scores, seen
+
+
+@pytest.mark.parametrize(("x", "y"), [(300.0, 200.0), (0.0, 0.0), (620.0, 460.0)])
+def test_a_window_shows_the_box_that_it_is_for(x: float, y: float) -> None:
+    ((left, top),) = window_corners(*boxes_of((x, y, 20, 0.4)), FINE.shape, SMALL_PX, THRESHOLD)
+    assert 0 <= left <= FINE.shape[1] - WINDOW_PX and 0 <= top <= FINE.shape[0] - WINDOW_PX
+    low, high = FINE_SCALE * np.array([x, y]), FINE_SCALE * np.array([x + 20, y + 20])
+    assert (low >= (left, top)).all() and (high <= np.array([left, top]) + WINDOW_PX).all()
+
+
+def test_only_small_uncertain_boxes_are_looked_at_again() -> None:
+    rows = (100.0, 100.0, 30.0, 0.3), (400.0, 300.0, 30.0, 0.8), (250.0, 250.0, 90.0, 0.4), (500.0, 20.0, 30.0, 0.02)
+    assert len(window_corners(*boxes_of(*rows), FINE.shape, SMALL_PX, THRESHOLD)) == 1
+    assert window_corners(*boxes_of(*rows[1:]), FINE.shape, SMALL_PX, THRESHOLD) == []
+
+
+def test_a_part_of_a_large_certain_drogue_is_not_looked_at_again() -> None:
+    whole, hub = (100.0, 100.0, 200.0, 0.9), (180.0, 180.0, 40.0, 0.4)
+    assert window_corners(*boxes_of(whole, hub), FINE.shape, SMALL_PX, THRESHOLD) == []
+    uncertain = boxes_of((100.0, 100.0, 200.0, 0.45), hub)
+    assert len(window_corners(*uncertain, FINE.shape, SMALL_PX, THRESHOLD)) == 1
+    # Nor does a part count that the window of a box beside the drogue shows: its middle is at (292, 152) in the input.
+    boxes, _, seen = again(boxes_of(whole, (310.0, 130.0, 40.0, 0.3)), answers((2, 12, 40, 0.8), (14, 12, 40, 0.7)))
+    assert len(seen) == 1
+    assert sorted(boxes[:, 2].tolist()) == pytest.approx([20, 200], abs=1e-3)
+
+
+def test_neighbouring_boxes_share_a_window_and_there_are_two_at_most() -> None:
+    near = (100.0, 100.0, 20.0, 0.4), (110.0, 105.0, 20.0, 0.3)
+    assert len(window_corners(*boxes_of(*near), FINE.shape, SMALL_PX, THRESHOLD)) == 1
+    apart = [(100.0 * column, 100.0, 20.0, 0.4) for column in range(1, 6)]
+    assert len(window_corners(*boxes_of(*apart), FINE.shape, SMALL_PX, THRESHOLD)) == 2
+
+
+def test_what_the_window_shows_replaces_the_box_and_its_score() -> None:
+    # The cell's middle is at (12.5, 12.5) cells, 100 px of the window; the window begins at (2 * 110 - 96, same) px.
+    boxes, scores, _ = again(boxes_of((100, 100, 20, 0.4)), answers((12, 12, 44, 0.8)))
+    assert scores == pytest.approx([0.8], abs=1e-6)
+    middle = (2 * 110 - 96 + 100) / 2
+    # Logarithms are float32.
+    np.testing.assert_allclose(boxes, [[middle - 11, middle - 11, 22, 22]], atol=1e-3)
+
+
+def test_a_box_of_which_the_window_shows_nothing_is_gone() -> None:
+    boxes, scores, _ = again(boxes_of((100, 100, 20, 0.6), (400, 300, 150, 0.3)), answers())
+    assert scores.tolist() == [0.3] and boxes[0, 2] == 150
+
+
+def test_boxes_at_the_edge_of_a_window_stay_as_they_were() -> None:
+    # The window reaches from 62 to 158 px of the input; the second box's middle is 4 px from its edge.
+    boxes, scores, _ = again(
+        boxes_of((100, 100, 20, 0.4), (144, 100, 20, 0.09)), answers((12, 12, 44, 0.8), (23, 12, 44, 0.6))
+    )
+    assert scores == pytest.approx([0.8, 0.09], abs=1e-6)
+    assert boxes[1].tolist() == [144, 100, 20, 20]
+
+
+def test_low_scores_are_left_out_after_the_second_look() -> None:
+    _, scores, _ = again(boxes_of((100, 100, 20, 0.2)), answers((12, 12, 44, 0.6)), least_score=0.5)
+    assert scores == pytest.approx([0.6], abs=1e-6)
+    _, scores, _ = again(boxes_of((100, 100, 20, 0.6)), answers((12, 12, 44, 0.3)), least_score=0.5)
+    assert len(scores) == 0
+
+
+def test_images_smaller_than_a_window_are_not_looked_at_again() -> None:
+    assert window_corners(*boxes_of((10, 10, 20, 0.4)), (128, 640, 3), SMALL_PX, THRESHOLD) == []
+
+
+def test_the_detector_measures_small_squares_at_twice_the_scale(tmp_path: Path) -> None:
+    # The network of these tests predicts boxes of two cells, of 8 px or more, around red cells; this red is uncertain.
+    image = np.full((512, 640, 3), 90, np.uint8)
+    image[192:224, 256:288] = (193, 0, 0)
+    images = StereoImages(image, image, time_s=0.0, exposure_s=1e-3, encoding="gamma")
+    for small_below_px, shrink in ((0.0, 1), (SMALL_PX, FINE_SCALE)):
+        metadata = ModelMetadata(input_size_px=(320, 256), score_threshold=0.5, small_below_px=small_below_px)
+        detector = OnnxDetector(write_red_squares(tmp_path, metadata=metadata))
+        for found in detector.candidates(images, 0.3).values():
+            assert min(one.box_xywh_px[2] for one in found) == pytest.approx(32 / shrink)
+        # A single picture is searched at its own size, twice that of the pair's images.
+        alone = detector.candidates_in_picture(image, 0.3)
+        assert min(one.box_xywh_px[2] for one in alone) == pytest.approx(16 / shrink)
+
+
+def test_inputs_whose_double_is_too_large_are_not_looked_at_again(tmp_path: Path) -> None:
+    image = np.full((64, 96, 3), 90, np.uint8)
+    image[16:32, 16:32] = (193, 0, 0)
+    metadata = ModelMetadata(input_size_px=(320, 256), score_threshold=0.5, small_below_px=SMALL_PX)
+    file = write_red_squares(tmp_path, metadata=metadata)
+    images = StereoImages(image, image, time_s=0.0, exposure_s=1e-3, encoding="gamma")
+    # Twice 2080 px is more than an input may have.
+    assert OnnxDetector(file, input_size_px=(2080, 64)).candidates(images, 0.3)["left"]
+
+
+def test_a_network_of_one_size_cannot_look_again(tmp_path: Path) -> None:
+    metadata = ModelMetadata(input_size_px=(320, 256), small_below_px=80.0)
+    file = write_red_squares(tmp_path, metadata=metadata, shape=(2, 3, 256, 320))
+    with pytest.raises(ValueError, match="small_below_px: takes 320x256 px only, and no windows of 192x192 px"):
+        OnnxDetector(file)
