@@ -44,7 +44,8 @@ _PART_FACTOR, _MAX_INSIDE = 2.0, 0.5
 
 def detect_again(
     coarse: Sequence[ScoredBoxes],
-    fine_images: Sequence[NDArray[np.uint8]],
+    fine_images: Sequence[Callable[[], NDArray[np.uint8]]],
+    fine_size_px: tuple[int, int],
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
     small_below_px: float,
     score_threshold: float,
@@ -55,7 +56,9 @@ def detect_again(
 
     Args:
         coarse: boxes and scores of each image from `LEAST_CANDIDATE` on, in corner coordinates of the network's input.
-        fine_images: the same images at `FINE_SCALE` times the size of the input.
+        fine_images: functions that return the same images at `FINE_SCALE` times the size of the input; called where
+            there is something to look at.
+        fine_size_px: width and height of those. [px]
         run: the network, from images of one size to output maps; see `nav.detector.output_maps`.
         small_below_px: a box of the first pass whose longer side is below this is small. [px]
         score_threshold: from which a large box is certain to be a drogue.
@@ -65,13 +68,12 @@ def detect_again(
     Returns:
         Boxes and scores of each image, the best first, in corner coordinates of the network's input.
     """
-    corners = [
-        window_corners(boxes, scores, fine.shape, small_below_px, score_threshold)
-        for (boxes, scores), fine in zip(coarse, fine_images, strict=True)
-    ]
+    corners = [window_corners(*found, fine_size_px, small_below_px, score_threshold) for found in coarse]
     windows = [
         fine[top : top + WINDOW_PX, left : left + WINDOW_PX]
-        for fine, some in zip(fine_images, corners, strict=True)
+        for fine_image, some in zip(fine_images, corners, strict=True)
+        if some
+        for fine in (fine_image(),)
         for left, top in some
     ]
     seen = iter(decode_maps(run(windows), least_score) if windows else ())
@@ -84,19 +86,19 @@ def detect_again(
 
 
 def window_corners(
-    boxes: Array, scores: Array, fine_shape: tuple[int, ...], small_below_px: float, score_threshold: float
+    boxes: Array, scores: Array, fine_size_px: tuple[int, int], small_below_px: float, score_threshold: float
 ) -> list[tuple[int, int]]:
     """Left and top sides of the windows in the fine image, around the best small boxes of a first pass. [px]
 
     Args:
         boxes: (n, 4) in corner coordinates of the network's input, the best first. [px]
         scores: (n,).
-        fine_shape: height and width of the fine image first. [px]
+        fine_size_px: width and height of the fine image. [px]
         small_below_px: a box whose longer side is below this is small. [px]
         score_threshold: from which a large box is certain to be a drogue.
     """
-    height, width = fine_shape[:2]
-    if min(height, width) < WINDOW_PX:
+    width, height = fine_size_px
+    if min(width, height) < WINDOW_PX:
         return []
     stays = _are_certain(boxes, scores, small_below_px, score_threshold)
     wanted = (scores >= LEAST_CANDIDATE) & (scores < _CERTAIN) & (_sizes(boxes) < small_below_px)

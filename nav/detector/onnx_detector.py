@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +105,8 @@ class OnnxDetector:
         height, width = picture.shape[:2]
         size = self._fixed_size or self._picture_size(width, height)
         image, placement = letterbox_image(picture, size)
-        fine = letterbox_image(picture, _fine_size(size))[0] if self._looks_again(size) else image
         # A network whose batch is fixed takes both eyes.
+        fine = partial(_letterboxed, picture, _fine_size(size))
         (found, *_) = self._detect([image] * self._least_batch, [fine] * self._least_batch, least_score, _MOST_BOXES)
         return _placed(found, placement)
 
@@ -124,16 +125,14 @@ class OnnxDetector:
     ) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes in the images of some eyes, which pass through the network together."""
         inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in eyes), strict=True)
-        fine = inputs
-        if self._looks_again(self.input_size_px):
-            fine = tuple(input_image(images, eye, _fine_size(self.input_size_px))[0] for eye in eyes)
+        fine = [partial(_input_pixels, images, eye, _fine_size(self.input_size_px)) for eye in eyes]
         found = self._detect(inputs, fine, least_score, max_boxes)
         return {eye: _placed(some, placement) for eye, some, placement in zip(eyes, found, placements, strict=True)}
 
     def _detect(
         self,
         inputs: Sequence[NDArray[np.uint8]],
-        fine: Sequence[NDArray[np.uint8]],
+        fine: Sequence[Callable[[], NDArray[np.uint8]]],
         least_score: float,
         max_boxes: int,
     ) -> list[ScoredBoxes]:
@@ -141,7 +140,7 @@ class OnnxDetector:
 
         Args:
             inputs: of the network.
-            fine: the same images at twice the scale, where these are looked at.
+            fine: functions that return the same images at twice the scale.
             least_score: boxes with a lower score are left out.
             max_boxes: largest number of boxes of an image.
         """
@@ -153,7 +152,10 @@ class OnnxDetector:
         least = min(least_score, LEAST_CANDIDATE)
         found = detect_multiscale(inputs, self._run_images, large_from_px, least, _MOST_BOXES, passes)
         threshold = self.metadata.score_threshold
-        return detect_again(found, fine, self._run_in_pairs, small_below_px, threshold, least_score, max_boxes)
+        fine_size = _fine_size((width, height))
+        return detect_again(
+            found, fine, fine_size, self._run_in_pairs, small_below_px, threshold, least_score, max_boxes
+        )
 
     def _looks_again(self, size_px: tuple[int, int]) -> bool:
         """Whether small boxes in inputs of a width and height are looked at again; very large inputs show enough."""
@@ -187,6 +189,14 @@ class OnnxDetector:
 def _fine_size(input_size_px: tuple[int, int]) -> tuple[int, int]:
     width, height = input_size_px
     return FINE_SCALE * width, FINE_SCALE * height
+
+
+def _input_pixels(images: StereoImages, eye: Eye, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    return input_image(images, eye, size_px)[0]
+
+
+def _letterboxed(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    return letterbox_image(picture, size_px)[0]
 
 
 def _placed(found: ScoredBoxes, placement: Letterbox) -> tuple[Detection, ...]:

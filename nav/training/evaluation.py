@@ -12,6 +12,7 @@ import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -137,9 +138,13 @@ def predict(
     truth: list[Boxes] = []
     found: list[tuple[Boxes, Boxes]] = []
 
-    def read(group: Sequence[tuple[int, int]], scale: int = 1) -> list[tuple[Image, Boxes]]:
-        height_px, width_px = size_px
-        return [whole_image(corpus, pair, eye, (scale * height_px, scale * width_px)) for pair, eye in group]
+    fine_size_px = FINE_SCALE * size_px[0], FINE_SCALE * size_px[1]
+
+    def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
+        return [whole_image(corpus, pair, eye, size_px) for pair, eye in group]
+
+    def fine_image(pair: int, eye: int) -> Image:
+        return whole_image(corpus, pair, eye, fine_size_px)[0]
 
     def run(images: Sequence[Image]) -> list[NDArray[Any]]:
         with torch.inference_mode(), compute.autocast():
@@ -150,8 +155,9 @@ def predict(
         images, boxes = zip(*whole, strict=True)
         some = detect_multiscale(images, run, large_from_px, _MIN_SCORE, MAX_BOXES)
         if small_below_px:
-            fine = [image for image, _ in read(group, FINE_SCALE)]
-            some = detect_again(some, fine, run, small_below_px, DEFAULT_THRESHOLD, _MIN_SCORE, MAX_BOXES)
+            fine = [partial(fine_image, pair, eye) for pair, eye in group]
+            size = fine_size_px[::-1]
+            some = detect_again(some, fine, size, run, small_below_px, DEFAULT_THRESHOLD, _MIN_SCORE, MAX_BOXES)
         found += some
         truth += boxes
         advance()

@@ -66,6 +66,13 @@ def write_red_squares(
     return path
 
 
+def set_metadata(file: Path, metadata: ModelMetadata) -> None:
+    """Write metadata into a network's file."""
+    model = onnx.load(file)
+    helper.set_model_props(model, {METADATA_KEY: metadata.to_json()})
+    onnx.save(model, file)
+
+
 def make_network(config: NetworkConfig, seed: int = 0) -> DetectorNetwork:
     """A network in use, with statistics and weights that let the images influence the outputs."""
     generator = torch.Generator().manual_seed(seed)

@@ -1,13 +1,30 @@
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from datasets_manifest.types.images import StereoImages
+from geometry.stereo import EYES
+from nav.detector.input_image import letterbox
+from nav.detector.model_metadata import ModelMetadata
+from nav.detector.onnx_detector import OnnxDetector
+from nav.detector.output_maps import STRIDES
 from nav.training.corpus import Corpus
-from nav.training.evaluation import average_precision, best_threshold, measure_batch_statistics, to_tensor, whole_image
+from nav.training.evaluation import (
+    average_precision,
+    best_threshold,
+    measure_batch_statistics,
+    predict,
+    to_tensor,
+    whole_image,
+)
 from nav.training.training_settings import TrainingSettings
 from nav.training.training_state import ComputeDevice, new_network
+from tests.support.detector_networks import set_metadata
 
 NONE = (np.zeros((0, 4)), np.zeros(0))
 BOX = np.array([[10.0, 10.0, 20.0, 20.0]])
@@ -97,3 +114,45 @@ def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: 
 
 def normalizations(network: torch.nn.Module) -> list[torch.nn.BatchNorm2d]:
     return [module for module in network.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+
+
+class BrightCells(torch.nn.Module):
+    """Boxes of two cells around bright cells; the score is a half where three quarters of a cell are white."""
+
+    def forward(self, images: torch.Tensor) -> list[torch.Tensor]:
+        cells = [torch.nn.functional.avg_pool2d(images, stride).mean(dim=1, keepdim=True) for stride in STRIDES]
+        return [torch.cat((40 * each - 30, *[torch.zeros_like(each)] * 4), dim=1) for each in cells]
+
+
+@pytest.mark.parametrize("small_below_px", [0.0, 80.0])
+def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
+    ellipse_corpus: Corpus, tmp_path: Path, small_below_px: float
+) -> None:
+    network, size_px, file = BrightCells().eval(), ellipse_corpus.size_px, tmp_path / "bright.onnx"
+    axes = {0: "b", 2: "h", 3: "w"}
+    example = torch.zeros(2, 3, *size_px)
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        torch.onnx.export(
+            network, (example,), file, input_names=["images"], dynamic_axes={"images": axes}, dynamo=False
+        )
+    metadata = ModelMetadata(input_size_px=size_px[::-1], small_below_px=small_below_px)
+    set_metadata(file, metadata)
+    detector, compute = OnnxDetector(file), ComputeDevice(torch.device("cpu"), bf16=False)
+    seen = predict(network, ellipse_corpus, "train", size_px, 5, 0.0, compute, small_below_px=small_below_px)
+    placement = letterbox(size_px[::-1], size_px[::-1])
+    number = 0
+    for pair in ellipse_corpus.split("train"):
+        left, right = (ellipse_corpus.image(int(pair), eye) for eye in (0, 1))
+        images = StereoImages(left, right, time_s=0.0, exposure_s=1e-3, encoding="gamma")
+        candidates = detector.candidates(images, 0.01)
+        for eye in EYES:
+            boxes, scores = seen.found[number]
+            wanted = candidates[eye][: len(scores)]
+            np.testing.assert_allclose(scores, [one.score for one in wanted], rtol=0, atol=1e-5)
+            np.testing.assert_allclose(
+                placement.to_image(boxes), [one.box_xywh_px for one in wanted], rtol=0, atol=1e-3
+            )
+            number += 1
+    plain = predict(network, ellipse_corpus, "train", size_px, 5, 0.0, compute)
+    differ = [not np.array_equal(one, other) for (_, one), (_, other) in zip(seen.found, plain.found, strict=True)]
+    assert any(differ) == (small_below_px > 0)
