@@ -204,7 +204,7 @@ def exp_rotation(vector_rad: Array) -> Array:
 
 
 def log_rotation(rotation: Array) -> Array:
-    """(3,) rotation vector of a (3, 3) rotation, at most pi long. [rad]"""
+    """(3,) rotation vector of a (3, 3) rotation, which is not checked; at most pi long. [rad]"""
     # To check the matrix would take three times as long as the rest.
     vector: Array = Rotation.from_matrix(rotation, assume_valid=True).as_rotvec()
     return vector

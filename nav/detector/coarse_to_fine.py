@@ -26,10 +26,13 @@ FINE_SCALE = 2
 WINDOW_PX = 192
 """Width and height of a window in the fine image: room for a small drogue, and a multiple of 32. [px]"""
 
+LARGEST_SMALL_PX = WINDOW_PX // FINE_SCALE
+"""Largest side in the input of what a window can show. [px]"""
+
 LEAST_CANDIDATE = 0.1
 """Score from which a box of the first pass is looked at again."""
 
-# A box of the first pass from this score on is certain enough.
+# A box of the first pass from this score on is certain enough, where the network's threshold is not higher still.
 _CERTAIN = 0.7
 # Largest number of windows for an image.
 _MOST_WINDOWS = 2
@@ -101,7 +104,7 @@ def window_corners(
     if min(width, height) < WINDOW_PX:
         return []
     stays = _are_certain(boxes, scores, small_below_px, score_threshold)
-    wanted = (scores >= LEAST_CANDIDATE) & (scores < _CERTAIN) & (_sizes(boxes) < small_below_px)
+    wanted = (scores >= LEAST_CANDIDATE) & (scores < max(_CERTAIN, score_threshold)) & (_sizes(boxes) < small_below_px)
     wanted &= ~_are_parts(boxes, boxes[stays])
     corners: list[tuple[int, int]] = []
     for x, y, box_width, box_height in boxes[wanted]:
@@ -128,10 +131,11 @@ def _merged(
     """Boxes of windows, and those of the first pass that no window replaces, after non-maximum suppression."""
     boxes, scores = coarse
     certain = boxes[_are_certain(boxes, scores, small_below_px, score_threshold)]
+    is_uncertain = (_sizes(boxes) < small_below_px) & (scores < max(_CERTAIN, score_threshold))
     replaced = np.zeros(len(boxes), dtype=bool)
     found: list[ScoredBoxes] = []
     for window_boxes, window_scores, corner in windows:
-        replaced |= (_sizes(boxes) < small_below_px) & (scores < _CERTAIN) & _are_within(boxes, corner, _REPLACED_FROM)
+        replaced |= is_uncertain & _are_within(boxes, corner, _REPLACED_FROM)
         moved = (window_boxes + np.array([*corner, 0, 0])) / FINE_SCALE
         kept = (_sizes(moved) < _SIZE_FACTOR * small_below_px) & _are_within(moved, corner, _COUNTS_FROM)
         kept &= ~_are_parts(moved, certain)
@@ -161,7 +165,8 @@ def _are_within(boxes: Array, corner: tuple[int, int], margin: float) -> NDArray
 def _are_certain(boxes: Array, scores: Array, small_below_px: float, score_threshold: float) -> NDArray[np.bool_]:
     """(n,) whether boxes of the first pass are drogues that no window is needed for."""
     is_large = _sizes(boxes) >= small_below_px
-    certain: NDArray[np.bool_] = (scores >= _CERTAIN) | (is_large & (scores >= score_threshold))
+    is_sure = scores >= max(_CERTAIN, score_threshold)
+    certain: NDArray[np.bool_] = is_sure | (is_large & (scores >= score_threshold))
     return certain
 
 

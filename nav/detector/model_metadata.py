@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from drogue_models.untrusted_files import parse_json
+from nav.detector.coarse_to_fine import LARGEST_SMALL_PX
 from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
@@ -54,10 +55,10 @@ class ModelMetadata:
         # In Python a bool is an int.
         if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
-        for name in ("large_from_px", "small_below_px"):
+        for name, most in (("large_from_px", MAX_SIDE_PX), ("small_below_px", LARGEST_SMALL_PX)):
             side = getattr(self, name)
-            if type(side) not in (int, float) or not 0 <= side <= MAX_SIDE_PX:
-                raise ValueError(f"{name}: must be 0 to {MAX_SIDE_PX}, got {side!r}")
+            if type(side) not in (int, float) or not 0 <= side <= most:
+                raise ValueError(f"{name}: must be 0 to {most}, got {side!r}")
         if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
             raise ValueError(f"classes: must be one name, got {self.classes!r}")
         for name, kind in (("licence", str), ("manifest_sha256", str), ("network", Mapping), ("training", Mapping)):

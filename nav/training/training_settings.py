@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 from drogue_models.untrusted_files import parse_toml, read_text
+from nav.detector.coarse_to_fine import LARGEST_SMALL_PX
 from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 SizePx = tuple[int, int]
@@ -108,7 +109,7 @@ class TrainingSettings(FrozenModel):
     loader_workers: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
     large_from_px: float = Field(default=160.0, ge=0, le=MAX_SIDE_PX)
-    small_below_px: float = Field(default=0.0, ge=0, le=MAX_SIDE_PX)
+    small_below_px: float = Field(default=0.0, ge=0, le=LARGEST_SMALL_PX)
     start_sha256: str = Field(default="", pattern="^([0-9a-f]{64})?$", exclude_if=lambda digest: not digest)
     licence: str = Field(default="", max_length=100)
 

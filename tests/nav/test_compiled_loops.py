@@ -21,6 +21,7 @@ from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.matching import ring_matching
 from nav.numerics import levenberg_marquardt
+from nav.tracking import pose_predict
 from nav.realtime import warm_up_jit
 from nav.pair_navigator import PairNavigator
 from nav.pose import adjustment_loops
@@ -29,7 +30,8 @@ from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels, ring_matching)
+    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels, pose_predict,
+             ring_matching)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -41,6 +43,7 @@ for index in (1, 4):
     images = expose(frame, load_engine("analytic").render(frame, recipe.render))
     (estimate,) = PairNavigator(recipe.rig, recipe.drogue).estimate(index, images, ["joint-hub"])
     assert estimate.status == "fix"
+assert "_best_shift" in {name for name, _ in before}
 print(len(before), *sorted({name for name, _ in compiled() - before}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

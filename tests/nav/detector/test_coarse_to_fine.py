@@ -147,3 +147,15 @@ def test_a_network_of_one_size_cannot_look_again(tmp_path: Path) -> None:
     file = write_red_squares(tmp_path, metadata=metadata, shape=(2, 3, 256, 320))
     with pytest.raises(ValueError, match="small_below_px: takes 320x256 px only, and no windows of 192x192 px"):
         OnnxDetector(file)
+
+
+@pytest.mark.parametrize("wrong", [-1, float("nan"), 97, "80", True])
+def test_boxes_that_no_window_can_show_are_refused(wrong: float) -> None:
+    with pytest.raises(ValueError, match="small_below_px: must be 0 to 96"):
+        ModelMetadata(small_below_px=wrong)
+
+
+def test_below_a_high_threshold_nothing_is_certain() -> None:
+    box = boxes_of((100, 100, 20, 0.75))
+    assert window_corners(*box, FINE_PX, SMALL_PX, 0.5) == []
+    assert len(window_corners(*box, FINE_PX, SMALL_PX, 0.8)) == 1
