@@ -36,9 +36,10 @@ LEAST_CANDIDATE = 0.1
 _CERTAIN = 0.7
 # Largest number of windows for an image.
 _MOST_WINDOWS = 2
-# Shares of a window's side: a box of the first pass is replaced where its middle is this far from the window's edge,
-# and a box in the window counts where its middle is this far from it, since of others the edge cuts off too much.
-_REPLACED_FROM, _COUNTS_FROM = 0.15, 0.075
+# A window shows a box of the first pass whole where its sides, which are right to a few pixels, are this far from the
+# window's edge. A box in the window counts where its middle is this far from the edge, which cuts too much off others.
+# Neither holds at the image's own edge. [px of the fine image]
+_WHOLE_FROM_PX, _COUNTS_FROM_PX = 4.0, 14.0
 # A box in a window may be this much larger than what is looked at again: the first pass measures small boxes roughly.
 _SIZE_FACTOR = 1.25
 # A box this many times smaller than a certain one, of which more than a half lies in that, is a part of that drogue.
@@ -81,8 +82,10 @@ def detect_again(
     ]
     seen = iter(decode_maps(run(windows), least_score) if windows else ())
     return [
-        _merged(
-            found, [(*next(seen), corner) for corner in some], small_below_px, score_threshold, least_score, max_boxes
+        _first(
+            _replaced(found, [(*next(seen), corner) for corner in some], fine_size_px, small_below_px, score_threshold),
+            least_score,
+            max_boxes,
         )
         for found, some in zip(coarse, corners, strict=True)
     ]
@@ -112,41 +115,47 @@ def window_corners(
             int(np.clip(round(FINE_SCALE * middle - WINDOW_PX / 2), 0, size - WINDOW_PX))
             for middle, size in ((x + box_width / 2, width), (y + box_height / 2, height))
         )
-        # A window that shows the box in its middle half will do for it too.
-        if all(max(abs(left - one), abs(top - other)) >= WINDOW_PX / 4 for one, other in corners):
+        box = np.array([[x, y, box_width, box_height]])
+        if not any(_are_whole(box, corner, fine_size_px).all() for corner in corners):
             corners.append((left, top))
         if len(corners) == _MOST_WINDOWS:
             break
     return corners
 
 
-def _merged(
+def _replaced(
     coarse: ScoredBoxes,
     windows: Sequence[tuple[Array, Array, tuple[int, int]]],
+    fine_size_px: tuple[int, int],
     small_below_px: float,
     score_threshold: float,
-    least_score: float,
-    max_boxes: int,
 ) -> ScoredBoxes:
-    """Boxes of windows, and those of the first pass that no window replaces, after non-maximum suppression."""
+    """Boxes of windows, and those of the first pass that no window shows whole, in no order."""
     boxes, scores = coarse
     certain = boxes[_are_certain(boxes, scores, small_below_px, score_threshold)]
     is_uncertain = (_sizes(boxes) < small_below_px) & (scores < max(_CERTAIN, score_threshold))
-    replaced = np.zeros(len(boxes), dtype=bool)
+    stays = np.ones(len(boxes), dtype=bool)
     found: list[ScoredBoxes] = []
     for window_boxes, window_scores, corner in windows:
-        replaced |= is_uncertain & _are_within(boxes, corner, _REPLACED_FROM)
+        stays &= ~(is_uncertain & _are_whole(boxes, corner, fine_size_px))
         moved = (window_boxes + np.array([*corner, 0, 0])) / FINE_SCALE
-        kept = (_sizes(moved) < _SIZE_FACTOR * small_below_px) & _are_within(moved, corner, _COUNTS_FROM)
-        kept &= ~_are_parts(moved, certain)
+        low_px, high_px = _limits_px(corner, fine_size_px, _COUNTS_FROM_PX)
+        middles_px = FINE_SCALE * (moved[:, :2] + moved[:, 2:] / 2)
+        kept = ((middles_px > low_px) & (middles_px < high_px)).all(axis=1) & ~_are_parts(moved, certain)
+        kept &= _sizes(moved) < _SIZE_FACTOR * small_below_px
         found.append((moved[kept], window_scores[kept]))
-    stays = ~replaced & (scores >= least_score)
     every = [*found, (boxes[stays], scores[stays])]
-    merged, merged_scores = (np.concatenate(parts) for parts in zip(*every, strict=True))
-    order = np.argsort(-merged_scores, kind="stable")
-    merged, merged_scores = merged[order], merged_scores[order]
-    best = non_maximum_suppression(merged, max_boxes)
-    return merged[best], merged_scores[best]
+    all_boxes, all_scores = (np.concatenate(parts) for parts in zip(*every, strict=True))
+    return all_boxes, all_scores
+
+
+def _first(found: ScoredBoxes, least_score: float, max_boxes: int) -> ScoredBoxes:
+    """The best boxes after non-maximum suppression."""
+    boxes, scores = found
+    order = np.argsort(-scores, kind="stable")
+    order = order[scores[order] >= least_score]
+    best = order[non_maximum_suppression(boxes[order], max_boxes)]
+    return boxes[best], scores[best]
 
 
 def _sizes(boxes: Array) -> Array:
@@ -155,11 +164,22 @@ def _sizes(boxes: Array) -> Array:
     return sizes
 
 
-def _are_within(boxes: Array, corner: tuple[int, int], margin: float) -> NDArray[np.bool_]:
-    """(n,) whether the middles of boxes lie in a window, farther from its edge than a share of its side."""
-    from_corner = FINE_SCALE * (boxes[:, :2] + boxes[:, 2:] / 2) - corner
-    within: NDArray[np.bool_] = (np.abs(from_corner - WINDOW_PX / 2) < (0.5 - margin) * WINDOW_PX).all(axis=1)
-    return within
+def _limits_px(corner: tuple[int, int], fine_size_px: tuple[int, int], margin_px: float) -> tuple[Array, Array]:
+    """(2,) low and high limits of a window in the fine image, less a margin, and none at the image's own edge. [px]"""
+    low = [side + margin_px if side > 0 else -np.inf for side in corner]
+    high = [
+        side + WINDOW_PX - margin_px if side + WINDOW_PX < size else np.inf
+        for side, size in zip(corner, fine_size_px, strict=True)
+    ]
+    return np.array(low), np.array(high)
+
+
+def _are_whole(boxes: Array, corner: tuple[int, int], fine_size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """(n,) whether a window shows boxes whole, as far as the image does."""
+    low_px, high_px = _limits_px(corner, fine_size_px, _WHOLE_FROM_PX)
+    low, high = FINE_SCALE * boxes[:, :2], FINE_SCALE * (boxes[:, :2] + boxes[:, 2:])
+    whole: NDArray[np.bool_] = ((low >= low_px) & (high <= high_px)).all(axis=1)
+    return whole
 
 
 def _are_certain(boxes: Array, scores: Array, small_below_px: float, score_threshold: float) -> NDArray[np.bool_]:

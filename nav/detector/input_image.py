@@ -66,7 +66,9 @@ def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) ->
     return Letterbox((width / image_size_px[0], height / image_size_px[1]), offset)
 
 
-def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+def input_image(
+    images: StereoImages, eye: Eye, input_size_px: tuple[int, int], enlarged: int = 1
+) -> tuple[NDArray[np.uint8], Letterbox]:
     """The image of one eye as a network's input: 8 bit, display-encoded, at the network's size.
 
     Light above the black level is encoded by the sRGB curve, whatever the sensor's encoding and bit depth. The image is
@@ -76,29 +78,34 @@ def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) 
         images: the pair.
         eye: which image.
         input_size_px: width, height; multiples of 32.
+        enlarged: how many times as wide and high the result is, with the image at the same place in it.
 
     Returns:
-        (height, width, 3) red, green, blue, and where the image lies in it.
+        (enlarged * height, enlarged * width, 3) red, green, blue, and where the image lies in the input.
 
     Raises:
         ValueError: an input size that no network accepts.
     """
-    return letterbox_image(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
+    encoded = _display_encoded(images.left if eye == "left" else images.right, images)
+    return letterbox_image(encoded, input_size_px, enlarged)
 
 
-def letterbox_image(image: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+def letterbox_image(
+    image: NDArray[np.uint8], input_size_px: tuple[int, int], enlarged: int = 1
+) -> tuple[NDArray[np.uint8], Letterbox]:
     """Resize and pad a display-encoded image (H, W, 3) or (H, W) to a network's input; see `input_image`."""
     height, width = image.shape[:2]
     placement = letterbox((width, height), input_size_px)
-    size = round(width * placement.scale[0]), round(height * placement.scale[1])
-    enlarges = placement.scale[0] > 1
-    resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
+    size = enlarged * round(width * placement.scale[0]), enlarged * round(height * placement.scale[1])
+    grows = enlarged * placement.scale[0] > 1
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR if grows else cv2.INTER_AREA)
     if resized.ndim == 2:
         resized = cv2.cvtColor(resized, cv2.COLOR_GRAY2RGB)
-    if size == input_size_px:
+    whole = enlarged * input_size_px[0], enlarged * input_size_px[1]
+    if size == whole:
         return np.asarray(resized), placement
-    padded = np.full((input_size_px[1], input_size_px[0], 3), PADDING_DN, np.uint8)
-    left, top = placement.offset_px
+    padded = np.full((whole[1], whole[0], 3), PADDING_DN, np.uint8)
+    left, top = (enlarged * side for side in placement.offset_px)
     padded[top : top + size[1], left : left + size[0]] = resized
     return padded, placement
 

@@ -106,7 +106,7 @@ class OnnxDetector:
         size = self._fixed_size or self._picture_size(width, height)
         image, placement = letterbox_image(picture, size)
         # A network whose batch is fixed takes both eyes.
-        fine = partial(_letterboxed, picture, _fine_size(size))
+        fine = partial(_letterboxed, picture, size)
         (found, *_) = self._detect([image] * self._least_batch, [fine] * self._least_batch, least_score, _MOST_BOXES)
         return _placed(found, placement)
 
@@ -125,7 +125,7 @@ class OnnxDetector:
     ) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes in the images of some eyes, which pass through the network together."""
         inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in eyes), strict=True)
-        fine = [partial(_input_pixels, images, eye, _fine_size(self.input_size_px)) for eye in eyes]
+        fine = [partial(_input_pixels, images, eye, self.input_size_px) for eye in eyes]
         found = self._detect(inputs, fine, least_score, max_boxes)
         return {eye: _placed(some, placement) for eye, some, placement in zip(eyes, found, placements, strict=True)}
 
@@ -165,9 +165,9 @@ class OnnxDetector:
         return self._run(network_input(images))
 
     def _run_in_pairs(self, images: Sequence[NDArray[np.uint8]]) -> list[NDArray[Any]]:
-        """The maps of any number of images of one size: two a batch, as networks with a fixed batch take them."""
+        """The maps of any number of images of one size, two a batch; a fixed batch is filled with the same again."""
         pairs = [images[start : start + len(EYES)] for start in range(0, len(images), len(EYES))]
-        maps = [self._run_images([*pair, *pair][: len(EYES)]) for pair in pairs]
+        maps = [self._run_images([*pair, *pair][: max(len(pair), self._least_batch)]) for pair in pairs]
         return [np.concatenate(each)[: len(images)] for each in zip(*maps, strict=True)]
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
@@ -192,11 +192,11 @@ def _fine_size(input_size_px: tuple[int, int]) -> tuple[int, int]:
 
 
 def _input_pixels(images: StereoImages, eye: Eye, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    return input_image(images, eye, size_px)[0]
+    return input_image(images, eye, size_px, FINE_SCALE)[0]
 
 
 def _letterboxed(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    return letterbox_image(picture, size_px)[0]
+    return letterbox_image(picture, size_px, FINE_SCALE)[0]
 
 
 def _placed(found: ScoredBoxes, placement: Letterbox) -> tuple[Detection, ...]:

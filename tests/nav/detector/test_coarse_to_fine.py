@@ -106,6 +106,34 @@ def test_boxes_at_the_edge_of_a_window_stay_as_they_were() -> None:
     assert boxes[1].tolist() == [144, 100, 20, 20]
 
 
+@pytest.mark.parametrize(("x", "y"), [(0, 200), (620, 200), (300, 0), (300, 460), (-8, -8)])
+def test_a_box_at_the_edge_of_the_image_can_be_replaced_too(x: float, y: float) -> None:
+    boxes, _, seen = again(boxes_of((x, y, 20, 0.6)), answers())
+    assert len(seen) == 1 and len(boxes) == 0
+
+
+def test_a_box_that_the_window_of_another_cuts_has_one_of_its_own() -> None:
+    small, wide = (100.0, 100.0, 20.0, 0.6), (93.0, 71.0, 78.0, 0.58)
+    boxes, _, seen = again(boxes_of(small, wide), answers(), answers())
+    assert len(seen) == 2 and len(boxes) == 0
+    # With both windows taken by others it stays as it was.
+    other = (400.0, 300.0, 20.0, 0.59)
+    boxes, scores, seen = again(boxes_of(small, other, wide), answers(), answers())
+    assert len(seen) == 2 and scores.tolist() == [0.58] and boxes[0].tolist() == [93, 71, 78, 78]
+
+
+def test_windows_of_several_images_are_not_mixed_up() -> None:
+    coarse = [boxes_of((100, 100, 20, 0.4)), boxes_of(), boxes_of((100, 100, 20, 0.4), (400, 300, 20, 0.3))]
+    scores = iter((0.8, 0.75, 0.72))
+
+    def run(images: Sequence[NDArray[np.uint8]]) -> Sequence[NDArray[Any]]:
+        maps = [answers((12, 12, 44, next(scores))) for _ in images]
+        return [np.concatenate(each) for each in zip(*maps, strict=True)]
+
+    found = detect_again(coarse, [lambda: FINE] * 3, FINE_PX, run, SMALL_PX, THRESHOLD, 0.05, 20)
+    assert [score.round(2).tolist() for _, score in found] == [[0.8], [], [0.75, 0.72]]
+
+
 def test_low_scores_are_left_out_after_the_second_look() -> None:
     _, scores, _ = again(boxes_of((100, 100, 20, 0.2)), answers((12, 12, 44, 0.6)), least_score=0.5)
     assert scores == pytest.approx([0.6], abs=1e-6)

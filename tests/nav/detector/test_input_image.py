@@ -117,3 +117,14 @@ def test_sizes_that_no_network_takes_are_refused(size: tuple[int, int]) -> None:
 def test_absurd_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="input_size_px: must be at most 4096 a side, got 3200x3200000"):
         letterbox((1280, 960), (3200, 3_200_000))
+
+
+@pytest.mark.parametrize(("image_size", "input_size"), [*SIZES, ((1000, 701), (640, 480)), ((999, 700), (640, 480))])
+def test_an_enlarged_input_shows_the_image_at_the_same_place(
+    image_size: tuple[int, int], input_size: tuple[int, int]
+) -> None:
+    white = np.full((image_size[1], image_size[0], 3), 255, np.uint8)
+    plain, place = input_image(stereo(white, encoding="gamma"), "left", input_size)
+    large, same = input_image(stereo(white, encoding="gamma"), "left", input_size, enlarged=2)
+    assert same == place
+    np.testing.assert_array_equal(large, plain.repeat(2, axis=0).repeat(2, axis=1))
