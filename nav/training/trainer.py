@@ -9,6 +9,8 @@ some images a drogue of another one is pasted.
 from __future__ import annotations
 
 import math
+import multiprocessing
+import multiprocessing.connection
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -69,6 +71,7 @@ _STEPS_PER_CURVE_POINT = 10
 _EPOCHS_PER_VALIDATION = 3
 _MOST_VALIDATIONS = 20
 _WORKER_ENDED = "DataLoader worker"  # in what torch says then
+_LONGEST_END_S = 5.0  # from the end of a process's connections to its own
 
 
 class Member(NamedTuple):
@@ -142,8 +145,20 @@ class BatchMaker:
             # OpenCV's own threads do not survive a fork.
             worker_init_fn=lambda _: cv2.setNumThreads(0),
         )
-        for images, boxes in loader:
-            yield Batch(images.numpy(), boxes)
+        batches = iter(loader)
+        processes = multiprocessing.active_children()
+        try:
+            for images, boxes in batches:
+                yield Batch(images.numpy(), boxes)
+        except (OSError, EOFError) as error:
+            # A process that is killed loses its connections before it ends, and torch tells only of the end.
+            ended = multiprocessing.connection.wait([process.sentinel for process in processes], _LONGEST_END_S)
+            if not ended:
+                raise
+            for process in processes:
+                if process.sentinel in ended:
+                    process.join()
+            raise RuntimeError(_WORKER_ENDED) from error
 
     def _sample(self, step: int, epoch: int, position: int) -> Iterator[tuple[Image, Boxes]]:
         """Augmented images and boxes of a sample, one eye or both."""

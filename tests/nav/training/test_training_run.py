@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
 from nav.training.evaluation import average_precision, measure_batch_statistics, predict, to_tensor, whole_image
-from nav.training.trainer import is_validation_due
+from nav.training.trainer import Batch, BatchMaker, is_validation_due
 from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import (
@@ -152,6 +153,35 @@ def test_a_process_that_is_killed_ends_the_training_in_one_line(split_dataset: P
 
     with pytest.raises(OSError, match=r"^loader_workers: a process that prepares images was ended.*fewer than 2$"):
         train([split_dataset], tmp_path, settings, PlainProgress(io.StringIO()), should_stop=kill_one)
+
+
+class BreakingBatchMaker(BatchMaker):
+    """A batch maker whose processes lose their connections in the third batch, and end a while later."""
+
+    is_broken = multiprocessing.get_context("fork").Event()
+
+    def batch(self, step: int) -> Batch:
+        if step < 4:
+            return super().batch(step)
+        time.sleep(0.3)  # until the batches before are on their way
+        os.closerange(3, 1 << 16)
+        self.is_broken.set()
+        time.sleep(0.3)
+        os._exit(1)
+
+
+def test_a_process_whose_connections_close_before_it_ends_is_told_as_ended(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, "image_passes": 4000, "loader_workers": 2})
+    corpus = open_corpus([split_dataset], tmp_path, settings.size_px, 1, PlainProgress(io.StringIO()))
+    maker = BreakingBatchMaker(corpus, settings)
+    batches = maker.batches(range(10), 2)
+    next(batches)
+    assert maker.is_broken.wait(30)
+    with pytest.raises(RuntimeError, match="DataLoader worker"):
+        list(batches)
+    # Nothing is raised by what ends after that.
+    for child in multiprocessing.active_children():
+        child.join()
 
 
 class Calls:
