@@ -12,6 +12,7 @@ from datasets_manifest.types.images import Pixels, StereoImages
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import Eye
+from nav.matching.connected_regions import connected_regions
 
 # A filled ellipse covers pi/4 = 0.785 of its box; squares of a few pixels cover all of it, a ring or a crescent half.
 _LEAST_FILL = 0.55
@@ -51,15 +52,15 @@ def disc_like_blobs(mask: NDArray[np.uint8], least_area_px2: float, most: int) -
     Returns:
         Blobs in descending order of area.
     """
-    _, _, stats, centers = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    left, top, width, height, area = (stats[1:, column] for column in range(5))
-    rows, columns = mask.shape
+    regions = connected_regions(mask)
+    left, top, width, height = regions.boxes.T
+    area, (rows, columns) = regions.areas_px2, mask.shape
     inside = (left > 0) & (top > 0) & (left + width < columns) & (top + height < rows)
     compact = (width <= _MOST_ELONGATED * height) & (height <= _MOST_ELONGATED * width)
     filled = area >= _LEAST_FILL * width * height
     keep = np.flatnonzero(inside & compact & filled & (area >= least_area_px2))
     keep = keep[np.argsort(-area[keep], kind="stable")][:most]
-    return Blobs(centers[1:][keep].astype(np.float64), area[keep].astype(np.float64))
+    return Blobs(regions.centers_px[keep], area[keep].astype(np.float64))
 
 
 # Left, top, right, bottom of a part of an image, the last two exclusive. [px]
