@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -66,8 +68,7 @@ def disc_image_centers(
     """
     if rig.lens(eye) is None:
         return project_disc_centers(rig, left_from_drogue, centers_drogue_m, radii_m, eye)
-    places = zip(np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m), strict=True)
-    outlines = [disc_outline(left_from_drogue, center, radius, _OUTLINE_POINTS) for center, radius in places]
+    outlines = disc_outline(left_from_drogue, np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m), _OUTLINE_POINTS)
     return np.stack([_polygon_centroid(rig.image(outline, eye)) for outline in outlines])
 
 
@@ -81,11 +82,31 @@ def _polygon_centroid(corners: Array) -> Array:
     return center
 
 
-def disc_outline(left_from_drogue: RigidTransform, center_drogue_m: ArrayLike, radius_m: float, count: int) -> Array:
-    """(count, 3) points evenly spaced on the edge of a disc across the drogue's axis, in the left camera. [m]"""
+def disc_outline(
+    left_from_drogue: RigidTransform, centers_drogue_m: ArrayLike, radii_m: ArrayLike, count: int
+) -> Array:
+    """Points evenly spaced on the edges of discs across the drogue's axis, in the left camera.
+
+    Args:
+        left_from_drogue: the drogue's pose.
+        centers_drogue_m: (..., 3) centres of the discs. [m]
+        radii_m: (...) their radii. [m]
+        count: number of points on each.
+
+    Returns:
+        (..., count, 3) points. [m]
+    """
+    edges = _unit_circle(count) * np.asarray(radii_m, dtype=np.float64)[..., None, None]
+    return left_from_drogue.apply(np.asarray(centers_drogue_m, dtype=np.float64)[..., None, :] + edges)
+
+
+@cache
+def _unit_circle(count: int) -> Array:
+    """(count, 3) points evenly spaced on a circle of radius one across the third axis."""
     angle = 2 * np.pi * np.arange(count) / count
-    edge = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1) * radius_m
-    return left_from_drogue.apply(np.asarray(center_drogue_m, dtype=np.float64) + edge)
+    circle: Array = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1)
+    circle.flags.writeable = False
+    return circle
 
 
 def disc_area_px2(

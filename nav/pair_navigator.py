@@ -51,6 +51,7 @@ from nav.matching.ring_matching import (
     match_ring_near,
     symmetry_permutations,
 )
+from nav.numerics.medians import median
 from nav.pair_measurement import PairMeasurement, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
@@ -420,7 +421,7 @@ def _markers(centroids: BinaryCentroids, ring: RingMatch) -> _EyeMarkers:
     found = ring.blob_of_marker >= 0
     blob = ring.blob_of_marker[found]
     areas = centroids.blobs.areas_px2[blob]
-    whole = np.abs(np.log(areas / np.median(areas))) < np.log(_AREA_FACTOR)
+    whole = np.abs(np.log(areas / median(areas))) < np.log(_AREA_FACTOR)
     found[found] = whole
     centers = np.full((len(found), 2), np.nan)
     covariances = np.full((len(found), 2, 2), np.nan)
@@ -458,7 +459,7 @@ def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers) -> tuple[Array, Ar
     both = np.isfinite(rows_px)
     sigma_px = np.sqrt(left.cov_px2[:, 1, 1] + right.cov_px2[:, 1, 1])
     bad = np.zeros_like(both)
-    off_px = np.abs(rows_px[both] - np.median(rows_px[both]))
+    off_px = np.abs(rows_px[both] - median(rows_px[both]))
     bad[both] = off_px > _ROW_TOLERANCE_PX + _ROW_TOLERANCE_SIGMA * sigma_px[both]
     pixels = np.stack([left.centers_px, right.centers_px])
     covariances = np.stack([left.cov_px2, right.cov_px2])

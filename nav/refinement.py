@@ -27,6 +27,7 @@ from nav.centroids.outline_pixels import WHOLE_RADIUS_PX
 from nav.centroids.small_discs import EDGELESS_RADIUS_PX, LARGEST_SMALL_RADIUS_PX, fit_small_discs
 from nav.lens_correction import distort_points, undistort_points
 from nav.matching.marker_channel import PLAIN, balancing_weight
+from nav.numerics.medians import median
 from nav.pose.joint import joint
 from nav.pose.monocular import mono_lm
 from nav.pose.pose_method import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
@@ -100,7 +101,7 @@ def _are_placed(observation: Observation, rough: Solution) -> bool:
     variances = np.einsum("enii->en", observation.cov_px2)[observation.seen] / 2
     freedom = max(2 * int(observation.seen.sum()) - _POSE_PARAMETERS, 1)
     scatter = 2 * rough.modes[0].cost / freedom
-    return bool(np.median(variances) < _LARGEST_SIGMA_PX**2 and scatter < _LARGEST_SCATTER)
+    return bool(median(variances) < _LARGEST_SIGMA_PX**2 and scatter < _LARGEST_SCATTER)
 
 
 def _are_mostly_clipped(signals: tuple[MarkerSignal, MarkerSignal], discs: Ellipses) -> bool:
@@ -219,11 +220,11 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
     depth_m = pose.translation_m[2]
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
     even = np.broadcast_to(_middle_shapes(rig, layout, pose, radius_px)[:, None], (len(EYES), layout.count, 2, 2))
-    outlines_m = np.concatenate(
-        [disc_outline(pose, at_m, layout.radius_m, _OUTLINE_POINTS) for at_m in layout.centers_m]
-    )
+    if radius_px <= WHOLE_RADIUS_PX:
+        return even
+    outlines_m = disc_outline(pose, layout.centers_m, layout.radius_m, _OUTLINE_POINTS).reshape(-1, 3)
     # A wrong rough pose may place part of the drogue beside or behind the eyes.
-    if radius_px <= WHOLE_RADIUS_PX or outlines_m[:, 2].min() < depth_m / 2:
+    if outlines_m[:, 2].min() < depth_m / 2:
         return even
     points = np.stack([rig.image(outlines_m, eye) for eye in EYES]).reshape(-1, _OUTLINE_POINTS, 2)
     shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
@@ -251,7 +252,7 @@ def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> li
     if layout.hub_center_m is None or pose.apply(layout.hub_center_m)[2] <= 0:
         return []
     radii_m = layout.hub_inner_radius_m, layout.hub_outer_radius_m
-    outlines = np.stack([disc_outline(pose, layout.hub_center_m, radius_m, _OUTLINE_POINTS) for radius_m in radii_m])
+    outlines = disc_outline(pose, np.stack([layout.hub_center_m] * HUB_EDGES), radii_m, _OUTLINE_POINTS)
     points = np.stack([rig.image(outlines, eye) for eye in EYES], axis=1)
     shapes = outline_shapes((points - points.mean(axis=2, keepdims=True)).reshape(-1, _OUTLINE_POINTS, 2))
     places = np.stack([layout.hub_center_m] * HUB_EDGES), np.array(radii_m)

@@ -19,6 +19,7 @@ from geometry.se3 import Array
 from nav.matching.face_ring import fit_face_ring, has_narrow_face
 from nav.matching.marker_channel import Blobs, Window, disc_like_blobs
 from nav.matching.ring_matching import RingMatch, match_ring
+from nav.numerics.medians import median
 
 # Share of the box added on every side, so that a slightly small box cuts no marker.
 _BOX_MARGIN_FRACTION = 0.06
@@ -162,7 +163,7 @@ def _regions(roi: Pixels, level: float, dark: Mask | None) -> tuple[Blobs, bool]
     inside = roi > level if dark is None else (roi > level) & dark
     mask: NDArray[np.uint8] = inside.view(np.uint8)
     blobs = disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS)
-    if len(blobs) == 0 or 2 * np.median(blobs.radii_px) < _LEAST_DIAMETER_FOR_MORPHOLOGY_PX:
+    if len(blobs) == 0 or 2 * median(blobs.radii_px) < _LEAST_DIAMETER_FOR_MORPHOLOGY_PX:
         return blobs, False
     opened = cv2.morphologyEx(cv2.medianBlur(mask, 3), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return disc_like_blobs(np.asarray(opened), _LEAST_AREA_PX2, _MOST_BLOBS), True

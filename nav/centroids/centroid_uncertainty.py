@@ -14,6 +14,7 @@ from geometry.se3 import Array
 from nav.centroids.outline_pixels import OutlinePixels
 from nav.numerics.compiled import Array32, compiled
 from nav.numerics.levenberg_marquardt import Minimum
+from nav.numerics.medians import median
 
 _F = np.float32
 _ONE, _HALF, _QUARTER = _F(1), _F(0.5), _F(0.25)
@@ -171,8 +172,8 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
     """
     sums = zone_sums(squares, present, inside, _ZONES)
     mean = sums[:, 0, 0] / np.maximum(sums[:, 0, 1], 1)
-    usual = mean <= _ODD_FACTOR * np.median(mean)
-    level = float(np.median(contrast[usual]))
+    usual = mean <= _ODD_FACTOR * median(mean)
+    level = median(contrast[usual])
     totals, counts = sums[usual, 1:].sum(axis=0).T
     dark, edge, bright = (totals / np.maximum(counts, 1)).tolist()
     dark = max(dark, _LEAST_DARK_SHARE * bright, _QUANTISATION_DN2)
@@ -265,7 +266,7 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
     swallowed = np.einsum("nsp,nsp->ns", np.matmul(coupled, fit.covariance()), coupled)
     found = (shift**2 / alone).sum(axis=1)
     expected = np.maximum((1 - swallowed / alone).sum(axis=1), 1.0)
-    usual = found / expected <= _ODD_FACTOR * np.median(found / expected)
+    usual = found / expected <= _ODD_FACTOR * median(found / expected)
     return float((found[usual].sum() + _PRIOR_PIECES) / (expected[usual].sum() + _PRIOR_PIECES))
 
 

@@ -42,6 +42,7 @@ from nav.centroids.outline_pixels import OutlinePixels, disc_pixels
 from nav.centroids.pixel_response import correct_pixel_response
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
+from nav.numerics.medians import median
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
 _LEAST_RADIUS_FOR_SHADING_PX = 7.5
@@ -189,7 +190,7 @@ def _fit_given_motion(
     # wide that tenths are enough.
     lost = ~np.isfinite(minimum.parameters).all(axis=1) | ~are_positive(parameter_shapes(minimum.parameters))
     found = _fitted_ellipses(start, pixels, minimum, tuple("the fit left the disc" if each else None for each in lost))
-    width_px = float(np.median(minimum.parameters[:, DISC_WIDTH]))
+    width_px = median(minimum.parameters[:, DISC_WIDTH])
     shares = background_shares(face, found, pixels, width_px, motions)
     still = disc_model(pixels, sloped, shaded, shares, is_clipped)
     model = still if motions is None else motion_blurred(still, motions, (0,))
@@ -301,7 +302,7 @@ def restore_even_colors(
         The fit after one linear step, and the pixels; of discs whose other colours are even, both are those of the
         markers' colour alone.
     """
-    bright_dn2 = noise.dark_dn2 + noise.per_signal_dn * np.median(contrast)
+    bright_dn2 = noise.dark_dn2 + noise.per_signal_dn * median(contrast)
     if pixels.others is None or noise.dark_dn2 > _MOST_DARK_SHARE * bright_dn2:
         return fit, pixels
     weights = pixels.present

@@ -10,7 +10,7 @@ what stands still outside moves on a circle about the camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -101,7 +101,7 @@ POSITION, ATTITUDE, VELOCITY, RATE, VIBRATION_SHIFT, VIBRATION_TURN = (
 )
 VIBRATION = slice(12, 18)
 SIZE = 18
-_AXES = np.eye(3)
+_AXES, _IDENTITY = np.eye(3), np.eye(SIZE)
 # Size of the reported error: position and attitude as the camera sees them, velocity, rate.
 REPORTED_SIZE = 12
 
@@ -142,7 +142,7 @@ class MotionState:
             covariance: (18, 18) of the error about `error` in this state's tangent; transformed to the new
                 state's tangent.
         """
-        reset = np.eye(SIZE)
+        reset = _IDENTITY.copy()
         reset[ATTITUDE, ATTITUDE] = left_jacobian(error[ATTITUDE])
         return MotionState(
             translation_m=self.translation_m + error[POSITION],
@@ -244,11 +244,11 @@ def propagate(
     rotation_vector_rad = state.rate_rad_s * duration_s
     turn = exp_rotation(rotation_vector_rad)
     kept_vibration = float(np.exp(-duration_s / settings.vibration_s))
-    transition = np.eye(SIZE)
+    transition = _IDENTITY.copy()
     transition[POSITION, VELOCITY] = duration_s * _AXES
     transition[ATTITUDE, ATTITUDE] = turn
     transition[ATTITUDE, RATE] = duration_s * left_jacobian(rotation_vector_rad)
-    transition[VIBRATION, VIBRATION] = kept_vibration * np.eye(6)
+    transition[VIBRATION, VIBRATION] = kept_vibration * _IDENTITY[VIBRATION, VIBRATION]
     velocity, turn_shift_m = state.velocity_m_s, np.zeros(3)
     if turn_rad2_s3 > 0:
         turn_coupling = skew(state.rate_rad_s) * duration_s**2 / 2
@@ -263,11 +263,11 @@ def propagate(
         turn_density = apparent_pose_covariance(state.translation_m, 0.0, 0.0, turn_rad2_s3)
         noise += _white_acceleration_noise(turn_density, duration_s)
     noise[VIBRATION, VIBRATION] = (1 - kept_vibration**2) * vibration_covariance(state.translation_m, settings)
-    propagated = replace(
-        state,
+    propagated = MotionState(
         translation_m=state.translation_m + duration_s * state.velocity_m_s + turn_shift_m,
         velocity_m_s=velocity,
         rotation=orthonormal(turn @ state.rotation),
+        rate_rad_s=state.rate_rad_s,
         vibration_shift_m=kept_vibration * state.vibration_shift_m,
         vibration_turn_rad=kept_vibration * state.vibration_turn_rad,
         covariance=symmetric(transition @ state.covariance @ transition.T + noise),
@@ -320,10 +320,16 @@ def apparent_pose_covariance(
         attitude_variance: about each axis.
         camera_variance: of the camera's attitude, about each axis.
     """
-    lever = skew(translation_m)
-    seen = np.zeros((6, 6))
-    seen[:3, :3] = position_variance * _AXES + camera_variance * lever @ lever.T
-    seen[:3, 3:] = -camera_variance * lever
-    seen[3:, :3] = seen[:3, 3:].T
-    seen[3:, 3:] = (attitude_variance + camera_variance) * _AXES
-    return seen
+    # p I + c L L^T, -c L and (a + c) I with the lever L = [t]x: by floats, because numpy takes several times as long.
+    x, y, z = translation_m.tolist()
+    p, c, both = position_variance, camera_variance, attitude_variance + camera_variance
+    return np.array(
+        [
+            [p + c * (y * y + z * z), -c * x * y, -c * x * z, 0.0, c * z, -c * y],
+            [-c * x * y, p + c * (x * x + z * z), -c * y * z, -c * z, 0.0, c * x],
+            [-c * x * z, -c * y * z, p + c * (x * x + y * y), c * y, -c * x, 0.0],
+            [0.0, -c * z, c * y, both, 0.0, 0.0],
+            [c * z, 0.0, -c * x, 0.0, both, 0.0],
+            [-c * y, c * x, 0.0, 0.0, 0.0, both],
+        ]
+    )

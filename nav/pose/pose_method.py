@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
+from nav.numerics.medians import median
 
 
 @dataclass(frozen=True)
@@ -275,13 +277,13 @@ def _degenerate_pairs(observation: Observation) -> NoFixReason | None:
 def _rig_mismatch(observation: Observation) -> NoFixReason | None:
     """Whether disparities and the ring's size imply different distances, as with the wrong rig or drogue."""
     paired = observation.paired
-    first, second = np.triu_indices(int(paired.sum()), 1)
+    first, second = _pairs_of(int(paired.sum()))
     places, pixels = observation.layout.centers_m[paired], observation.pixels_px[:, paired]
     gaps_m, gaps_px = places[first] - places[second], pixels[:, first] - pixels[:, second]
     # Medians, so that one or two outliers do not count.
     px_per_m = np.sqrt((gaps_px**2).sum(axis=2) / (gaps_m**2).sum(axis=1))
-    expected_px = observation.rig.baseline_m * float(np.median(px_per_m))
-    disparity_px = float(np.median(pixels[0, :, 0] - pixels[1, :, 0]))
+    expected_px = observation.rig.baseline_m * median(px_per_m)
+    disparity_px = median(pixels[0, :, 0] - pixels[1, :, 0])
 
     def fits(size_px: float) -> bool:
         return abs(disparity_px - size_px) <= _RIG_MISMATCH_FRACTION * min(disparity_px, size_px) + _RIG_MISMATCH_PX
@@ -294,6 +296,13 @@ def _rig_mismatch(observation: Observation) -> NoFixReason | None:
         f"rig and drogue do not fit: markers this large have a disparity of {expected_px:.1f} px, "
         f"these have {disparity_px:.1f} px"
     )
+
+
+@cache
+def _pairs_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the first and of the second of all pairs of so many markers."""
+    first, second = np.triu_indices(count, 1)
+    return first, second
 
 
 def _largest_scale_px_per_m(observation: Observation) -> float:

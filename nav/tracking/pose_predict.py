@@ -207,9 +207,10 @@ def _otsu(levels: NDArray[np.uint8]) -> float:
 
 def _similarity(places: Array, spots: Array) -> tuple[Array, float]:
     """Least-squares shift and scale, without rotation, from (S, 2) positions to spots."""
-    from_middle = places - places.mean(axis=0)
-    scale = float((from_middle * (spots - spots.mean(axis=0))).sum() / (from_middle**2).sum())
-    shift: Array = spots.mean(axis=0) - scale * places.mean(axis=0)
+    middle, middle_spot = places.sum(axis=0) / len(places), spots.sum(axis=0) / len(spots)
+    from_middle = places - middle
+    scale = float((from_middle * (spots - middle_spot)).sum() / (from_middle**2).sum())
+    shift: Array = middle_spot - scale * middle
     return shift, scale
 
 

@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from geometry.se3 import RigidTransform, exp_rotation, exp_twist, left_jacobian, log_rotation
 from nav.filtering.measurement_update import compute_innovation, initial_state, pose_difference
-from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, propagate, vibration_covariance
+from nav.filtering.motion_model import (
+    SIZE,
+    FilterSettings,
+    MotionState,
+    apparent_pose_covariance,
+    propagate,
+    vibration_covariance,
+)
 
 # Central differences of smooth functions of order one: their own error is of the square of the step.
 STEP = 1e-5
@@ -140,3 +147,13 @@ def test_the_initial_pose_covariance_is_that_of_the_measurement(covariance: np.n
     state = initial_state(pose, covariance, FilterSettings())
     np.testing.assert_allclose(state.reported_covariance[:6, :6], covariance, atol=1e-15)
     np.linalg.cholesky(state.covariance)
+
+
+def test_a_turn_of_the_camera_shifts_and_turns_what_it_sees() -> None:
+    at_m, variances = np.array([0.4, -0.3, 5.0]), (0.01, 0.002, 0.03)
+    turns = np.eye(3)
+    by_turn = np.vstack([-np.cross(turns, at_m).T, -turns])
+    own = np.diag(np.repeat(variances[:2], 3))
+    np.testing.assert_allclose(
+        apparent_pose_covariance(at_m, *variances), own + variances[2] * by_turn @ by_turn.T, rtol=1e-14, atol=1e-16
+    )
