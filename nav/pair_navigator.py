@@ -9,10 +9,8 @@ right image's order against the left's is tried, and the one with the smallest e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from time import perf_counter
 from typing import Literal, TypeVar
 
@@ -51,6 +49,7 @@ from nav.matching.ring_matching import (
     match_ring_near,
     symmetry_permutations,
 )
+from nav.numerics.eye_threads import map_eyes
 from nav.numerics.medians import median
 from nav.pair_measurement import PairMeasurement, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
@@ -86,25 +85,6 @@ _ROW_TOLERANCE_PX = 1.0
 _ROW_TOLERANCE_SIGMA = 6.0
 # A marker cut by something before it has lost a third of its area before its centre is a fifth of a radius off.
 _AREA_FACTOR = 1.5
-
-
-def map_views(work: Callable[[Eye], Result], eyes: Collection[Eye]) -> dict[Eye, Result]:
-    """Apply a function to each eye; the second eye runs in a thread of its own.
-
-    OpenCV, and numpy on large arrays, release the interpreter lock meanwhile.
-
-    Raises:
-        Exception: any exception that `work` raises.
-    """
-    first, *others = eyes
-    waiting = {eye: _other_thread().submit(work, eye) for eye in others}
-    results = {first: work(first)}
-    return results | {eye: result.result() for eye, result in waiting.items()}
-
-
-@cache
-def _other_thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, thread_name_prefix="other-eye")
 
 
 class PairNavigator:
@@ -197,7 +177,7 @@ class PairNavigator:
 
         larger = max(box[2] * box[3] for box in boxes.values())
         centroids = (
-            map_views(centroids_of, boxes)
+            map_eyes(centroids_of, boxes)
             if larger > _LEAST_THREADED_AREA_PX2
             else {eye: centroids_of(eye) for eye in boxes}
         )

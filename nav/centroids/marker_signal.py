@@ -13,6 +13,7 @@ from geometry.stereo import EYES, Eye
 from nav.centroids.ellipses import Ellipses
 from nav.matching.marker_channel import PLAIN, color_difference, marker_channel
 from nav.numerics.compiled import Array32
+from nav.numerics.eye_threads import map_eyes
 
 # Margin around an outline: half the motion of up to 30 px while the shutter is open, the window, and the error of an
 # initial centre. [px]
@@ -83,15 +84,16 @@ def marker_signals(
         ellipses: the outlines; they may reach beyond the image.
         others_weight: see `nav.matching.marker_channel.marker_channel`.
     """
-    signals = []
-    for index, eye in enumerate(EYES):
-        window = _window(ellipses.take(ellipses.eyes == index), images.size_px)
+
+    def signal_of(eye: Eye) -> MarkerSignal:
+        window = _window(ellipses.take(ellipses.eyes == EYES.index(eye)), images.size_px)
         mosaic = images.left_mosaic if eye == "left" else images.right_mosaic
         if color is not None and mosaic is not None:
-            signals.append(_mosaic_signal(images, mosaic, window, (color, others_weight)))
-        else:
-            signals.append(_image_signal(images, eye, window, (color, others_weight)))
-    return signals[0], signals[1]
+            return _mosaic_signal(images, mosaic, window, (color, others_weight))
+        return _image_signal(images, eye, window, (color, others_weight))
+
+    signals = map_eyes(signal_of, EYES)
+    return signals["left"], signals["right"]
 
 
 def _window(ellipses: Ellipses, size_px: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -121,7 +121,7 @@ def image_region(image: EyeImage, window: Box, step_px: float) -> ImageRegion | 
     if right - left < 3 or bottom - top < 3:
         return None
     stride = max(1, int(step_px / _AVERAGED))
-    part = np.ascontiguousarray(image.pixels[top:bottom:stride, left:right:stride])
+    part = image.pixels[top:bottom:stride, left:right:stride]
     part_size = np.array([part.shape[1], part.shape[0]])
     size = np.maximum(1, np.round(part_size * stride / step_px)).astype(int)
     shrink_factor = part_size / size

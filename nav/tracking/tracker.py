@@ -15,6 +15,7 @@ from datasets_manifest.types.images import StereoImages
 from geometry.boxes import intersection_over_union
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
+from nav.numerics.eye_threads import map_eyes
 from nav.tracking.region import Box, EyeImage, box_center, box_size, eye_image, move_box
 
 BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
@@ -132,13 +133,15 @@ class StereoTracker:
 
     def follow(self, images: StereoImages, predicted: StereoDetection) -> StereoDetection:
         """See `Tracker`; an eye that lost the drogue searches again where the other eye's box predicts it."""
-        answers: dict[Eye, Detection | None] = dict.fromkeys(EYES)
-        for eye, tracker in self._eyes.items():
+
+        def locate(eye: Eye) -> Detection | None:
             prediction = predicted.of(eye)
             box = None if prediction is None else prediction.box_xywh_px
             is_visible = box is not None and _is_on_image(box, images.size_px)
-            answers[eye] = tracker.locate(eye_image(images, eye), box if is_visible else None, None)
-        consistent = self._consistent(images, StereoDetection(answers["left"], answers["right"]))
+            return self._eyes[eye].locate(eye_image(images, eye), box if is_visible else None, None)
+
+        answers = map_eyes(locate, self._eyes) if self._eyes else {}
+        consistent = self._consistent(images, _stereo_detection(answers))
         for eye, tracker in self._eyes.items():
             tracker.learn(eye_image(images, eye), consistent.of(eye))
         if consistent.left is not None and consistent.right is not None:
