@@ -20,7 +20,8 @@ def test_the_eyes_are_worked_on_at_the_same_time() -> None:
 
 
 def test_work_on_an_eye_may_work_on_both() -> None:
-    assert map_eyes(lambda _: map_eyes(len, EYES), EYES) == dict.fromkeys(EYES, {"left": 4, "right": 5})
+    lengths = {"left": 4, "right": 5}
+    assert map_eyes(lambda _: map_eyes(len, EYES), EYES) == {"left": lengths, "right": lengths}
 
 
 @pytest.mark.parametrize("failing", EYES)
