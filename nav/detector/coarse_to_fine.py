@@ -10,6 +10,7 @@ The idea is that of AutoFocus (Najibi, Singh, Davis 2019, doi:10.1109/ICCV.2019.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,13 +47,31 @@ _SIZE_FACTOR = 1.25
 _PART_FACTOR, _MAX_INSIDE = 2.0, 0.5
 
 
+@dataclass(frozen=True)
+class SecondLook:
+    """Which boxes of a first pass are looked at again.
+
+    Attributes:
+        fine_size_px: width and height of the images at `FINE_SCALE` times the size of the input. [px]
+        small_below_px: a box of the first pass whose longer side is below this is small. [px]
+        score_threshold: from which a large box is certain to be a drogue.
+    """
+
+    fine_size_px: tuple[int, int]
+    small_below_px: float
+    score_threshold: float
+
+    @property
+    def certain_from(self) -> float:
+        """Score from which a small box is certain to be a drogue."""
+        return max(_CERTAIN, self.score_threshold)
+
+
 def detect_again(
     coarse: Sequence[ScoredBoxes],
     fine_images: Sequence[Callable[[], NDArray[np.uint8]]],
-    fine_size_px: tuple[int, int],
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
-    small_below_px: float,
-    score_threshold: float,
+    look: SecondLook,
     least_score: float,
     max_boxes: int,
 ) -> list[ScoredBoxes]:
@@ -62,17 +81,15 @@ def detect_again(
         coarse: boxes and scores of each image from `LEAST_CANDIDATE` on, in corner coordinates of the network's input.
         fine_images: functions that return the same images at `FINE_SCALE` times the size of the input; called where
             there is something to look at.
-        fine_size_px: width and height of those. [px]
         run: the network, from images of one size to output maps; see `nav.detector.output_maps`.
-        small_below_px: a box of the first pass whose longer side is below this is small. [px]
-        score_threshold: from which a large box is certain to be a drogue.
+        look: which boxes are looked at again.
         least_score: boxes with a lower score are left out.
         max_boxes: largest number of boxes of an image.
 
     Returns:
         Boxes and scores of each image, the best first, in corner coordinates of the network's input.
     """
-    corners = [window_corners(*found, fine_size_px, small_below_px, score_threshold) for found in coarse]
+    corners = [window_corners(*found, look) for found in coarse]
     windows = [
         fine[top : top + WINDOW_PX, left : left + WINDOW_PX]
         for fine_image, some in zip(fine_images, corners, strict=True)
@@ -82,32 +99,24 @@ def detect_again(
     ]
     seen = iter(decode_maps(run(windows), least_score) if windows else ())
     return [
-        _first(
-            _replaced(found, [(*next(seen), corner) for corner in some], fine_size_px, small_below_px, score_threshold),
-            least_score,
-            max_boxes,
-        )
+        _first(_replaced(found, [(*next(seen), corner) for corner in some], look), least_score, max_boxes)
         for found, some in zip(coarse, corners, strict=True)
     ]
 
 
-def window_corners(
-    boxes: Array, scores: Array, fine_size_px: tuple[int, int], small_below_px: float, score_threshold: float
-) -> list[tuple[int, int]]:
+def window_corners(boxes: Array, scores: Array, look: SecondLook) -> list[tuple[int, int]]:
     """Left and top sides of the windows in the fine image, around the best small boxes of a first pass. [px]
 
     Args:
         boxes: (n, 4) in corner coordinates of the network's input, the best first. [px]
         scores: (n,).
-        fine_size_px: width and height of the fine image. [px]
-        small_below_px: a box whose longer side is below this is small. [px]
-        score_threshold: from which a large box is certain to be a drogue.
+        look: which boxes are looked at again.
     """
-    width, height = fine_size_px
+    width, height = look.fine_size_px
     if min(width, height) < WINDOW_PX:
         return []
-    stays = _are_certain(boxes, scores, small_below_px, score_threshold)
-    wanted = (scores >= LEAST_CANDIDATE) & (scores < max(_CERTAIN, score_threshold)) & (_sizes(boxes) < small_below_px)
+    stays = _are_certain(boxes, scores, look)
+    wanted = (scores >= LEAST_CANDIDATE) & (scores < look.certain_from) & (_sizes(boxes) < look.small_below_px)
     wanted &= ~_are_parts(boxes, boxes[stays])
     corners: list[tuple[int, int]] = []
     for x, y, box_width, box_height in boxes[wanted]:
@@ -116,7 +125,7 @@ def window_corners(
             for middle, size in ((x + box_width / 2, width), (y + box_height / 2, height))
         )
         box = np.array([[x, y, box_width, box_height]])
-        if not any(_are_whole(box, corner, fine_size_px).all() for corner in corners):
+        if not any(_are_whole(box, corner, look.fine_size_px).all() for corner in corners):
             corners.append((left, top))
         if len(corners) == _MOST_WINDOWS:
             break
@@ -126,23 +135,21 @@ def window_corners(
 def _replaced(
     coarse: ScoredBoxes,
     windows: Sequence[tuple[Array, Array, tuple[int, int]]],
-    fine_size_px: tuple[int, int],
-    small_below_px: float,
-    score_threshold: float,
+    look: SecondLook,
 ) -> ScoredBoxes:
     """Boxes of windows, and those of the first pass that no window shows whole, in no order."""
     boxes, scores = coarse
-    certain = boxes[_are_certain(boxes, scores, small_below_px, score_threshold)]
-    is_uncertain = (_sizes(boxes) < small_below_px) & (scores < max(_CERTAIN, score_threshold))
+    certain = boxes[_are_certain(boxes, scores, look)]
+    is_uncertain = (_sizes(boxes) < look.small_below_px) & (scores < look.certain_from)
     stays = np.ones(len(boxes), dtype=bool)
     found: list[ScoredBoxes] = []
     for window_boxes, window_scores, corner in windows:
-        stays &= ~(is_uncertain & _are_whole(boxes, corner, fine_size_px))
+        stays &= ~(is_uncertain & _are_whole(boxes, corner, look.fine_size_px))
         moved = (window_boxes + np.array([*corner, 0, 0])) / FINE_SCALE
-        low_px, high_px = _limits_px(corner, fine_size_px, _COUNTS_FROM_PX)
+        low_px, high_px = _limits_px(corner, look.fine_size_px, _COUNTS_FROM_PX)
         middles_px = FINE_SCALE * (moved[:, :2] + moved[:, 2:] / 2)
         kept = ((middles_px > low_px) & (middles_px < high_px)).all(axis=1) & ~_are_parts(moved, certain)
-        kept &= _sizes(moved) < _SIZE_FACTOR * small_below_px
+        kept &= _sizes(moved) < _SIZE_FACTOR * look.small_below_px
         found.append((moved[kept], window_scores[kept]))
     every = [*found, (boxes[stays], scores[stays])]
     all_boxes, all_scores = (np.concatenate(parts) for parts in zip(*every, strict=True))
@@ -182,11 +189,10 @@ def _are_whole(boxes: Array, corner: tuple[int, int], fine_size_px: tuple[int, i
     return whole
 
 
-def _are_certain(boxes: Array, scores: Array, small_below_px: float, score_threshold: float) -> NDArray[np.bool_]:
+def _are_certain(boxes: Array, scores: Array, look: SecondLook) -> NDArray[np.bool_]:
     """(n,) whether boxes of the first pass are drogues that no window is needed for."""
-    is_large = _sizes(boxes) >= small_below_px
-    is_sure = scores >= max(_CERTAIN, score_threshold)
-    certain: NDArray[np.bool_] = is_sure | (is_large & (scores >= score_threshold))
+    is_large = _sizes(boxes) >= look.small_below_px
+    certain: NDArray[np.bool_] = (scores >= look.certain_from) | (is_large & (scores >= look.score_threshold))
     return certain
 
 

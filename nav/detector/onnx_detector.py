@@ -18,7 +18,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 from datasets_manifest.types.images import StereoImages
 from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.stereo import EYES, Eye
-from nav.detector.coarse_to_fine import FINE_SCALE, LEAST_CANDIDATE, WINDOW_PX, detect_again
+from nav.detector.coarse_to_fine import FINE_SCALE, LEAST_CANDIDATE, WINDOW_PX, SecondLook, detect_again
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import Letterbox, input_image, letterbox, letterbox_image, network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
@@ -146,16 +146,13 @@ class OnnxDetector:
         """
         height, width = inputs[0].shape[:2]
         passes = len(self._pass_sizes((width, height)))
-        large_from_px, small_below_px = self.metadata.large_from_px, self.metadata.small_below_px
+        large_from_px = self.metadata.large_from_px
         if not self._looks_again((width, height)):
             return detect_multiscale(inputs, self._run_images, large_from_px, least_score, max_boxes, passes)
         least = min(least_score, LEAST_CANDIDATE)
         found = detect_multiscale(inputs, self._run_images, large_from_px, least, _MOST_BOXES, passes)
-        threshold = self.metadata.score_threshold
-        fine_size = _fine_size((width, height))
-        return detect_again(
-            found, fine, fine_size, self._run_in_pairs, small_below_px, threshold, least_score, max_boxes
-        )
+        look = SecondLook(_fine_size((width, height)), self.metadata.small_below_px, self.metadata.score_threshold)
+        return detect_again(found, fine, self._run_in_pairs, look, least_score, max_boxes)
 
     def _looks_again(self, size_px: tuple[int, int]) -> bool:
         """Whether small boxes in inputs of a width and height are looked at again; very large inputs show enough."""

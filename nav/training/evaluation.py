@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from datasets_manifest.storage.manifest import SplitName
 from geometry.boxes import intersection_over_union
-from nav.detector.coarse_to_fine import FINE_SCALE, detect_again
+from nav.detector.coarse_to_fine import FINE_SCALE, SecondLook, detect_again
 from nav.detector.input_image import PADDING_DN
 from nav.detector.multiscale_inference import detect_multiscale
 from nav.training.augmentation import Boxes, Image, paint_view, whole_view
@@ -139,6 +139,7 @@ def predict(
     found: list[tuple[Boxes, Boxes]] = []
 
     fine_size_px = FINE_SCALE * size_px[0], FINE_SCALE * size_px[1]
+    look = SecondLook(fine_size_px[::-1], small_below_px, DEFAULT_THRESHOLD)
 
     def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
         return [whole_image(corpus, pair, eye, size_px) for pair, eye in group]
@@ -156,8 +157,7 @@ def predict(
         some = detect_multiscale(images, run, large_from_px, _MIN_SCORE, MAX_BOXES)
         if small_below_px:
             fine = [partial(fine_image, pair, eye) for pair, eye in group]
-            size = fine_size_px[::-1]
-            some = detect_again(some, fine, size, run, small_below_px, DEFAULT_THRESHOLD, _MIN_SCORE, MAX_BOXES)
+            some = detect_again(some, fine, run, look, _MIN_SCORE, MAX_BOXES)
         found += some
         truth += boxes
         advance()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.images import StereoImages
 from geometry.se3 import Array
-from nav.detector.coarse_to_fine import FINE_SCALE, WINDOW_PX, detect_again, window_corners
+from nav.detector.coarse_to_fine import FINE_SCALE, WINDOW_PX, SecondLook, detect_again, window_corners
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.onnx_detector import OnnxDetector
 from nav.detector.output_maps import MAP_CHANNELS, STRIDES
@@ -20,6 +20,7 @@ from tests.support.detector_networks import write_red_squares
 
 SMALL_PX, THRESHOLD = 80.0, 0.5
 FINE_PX = (1280, 960)
+LOOK = SecondLook(FINE_PX, SMALL_PX, THRESHOLD)
 FINE = np.zeros((*FINE_PX[::-1], 3), np.uint8)
 
 
@@ -47,13 +48,13 @@ def again(
         seen.extend(images)
         return [np.concatenate(each) for each in zip(*windows[: len(images)], strict=True)]
 
-    ((boxes, scores),) = detect_again([coarse], [lambda: FINE], FINE_PX, run, SMALL_PX, THRESHOLD, least_score, 20)
+    ((boxes, scores),) = detect_again([coarse], [lambda: FINE], run, LOOK, least_score, 20)
     return boxes, scores, seen
 
 
 @pytest.mark.parametrize(("x", "y"), [(300.0, 200.0), (0.0, 0.0), (620.0, 460.0)])
 def test_a_window_shows_the_box_that_it_is_for(x: float, y: float) -> None:
-    ((left, top),) = window_corners(*boxes_of((x, y, 20, 0.4)), FINE_PX, SMALL_PX, THRESHOLD)
+    ((left, top),) = window_corners(*boxes_of((x, y, 20, 0.4)), LOOK)
     assert 0 <= left <= FINE_PX[0] - WINDOW_PX and 0 <= top <= FINE_PX[1] - WINDOW_PX
     low, high = FINE_SCALE * np.array([x, y]), FINE_SCALE * np.array([x + 20, y + 20])
     assert (low >= (left, top)).all() and (high <= np.array([left, top]) + WINDOW_PX).all()
@@ -61,15 +62,15 @@ def test_a_window_shows_the_box_that_it_is_for(x: float, y: float) -> None:
 
 def test_only_small_uncertain_boxes_are_looked_at_again() -> None:
     rows = (100.0, 100.0, 30.0, 0.3), (400.0, 300.0, 30.0, 0.8), (250.0, 250.0, 90.0, 0.4), (500.0, 20.0, 30.0, 0.02)
-    assert len(window_corners(*boxes_of(*rows), FINE_PX, SMALL_PX, THRESHOLD)) == 1
-    assert window_corners(*boxes_of(*rows[1:]), FINE_PX, SMALL_PX, THRESHOLD) == []
+    assert len(window_corners(*boxes_of(*rows), LOOK)) == 1
+    assert window_corners(*boxes_of(*rows[1:]), LOOK) == []
 
 
 def test_a_part_of_a_large_certain_drogue_is_not_looked_at_again() -> None:
     whole, hub = (100.0, 100.0, 200.0, 0.9), (180.0, 180.0, 40.0, 0.4)
-    assert window_corners(*boxes_of(whole, hub), FINE_PX, SMALL_PX, THRESHOLD) == []
+    assert window_corners(*boxes_of(whole, hub), LOOK) == []
     uncertain = boxes_of((100.0, 100.0, 200.0, 0.45), hub)
-    assert len(window_corners(*uncertain, FINE_PX, SMALL_PX, THRESHOLD)) == 1
+    assert len(window_corners(*uncertain, LOOK)) == 1
     # Nor does a part count that the window of a box beside the drogue shows: its middle is at (292, 152) in the input.
     boxes, _, seen = again(boxes_of(whole, (310.0, 130.0, 40.0, 0.3)), answers((2, 12, 40, 0.8), (14, 12, 40, 0.7)))
     assert len(seen) == 1
@@ -78,9 +79,9 @@ def test_a_part_of_a_large_certain_drogue_is_not_looked_at_again() -> None:
 
 def test_neighbouring_boxes_share_a_window_and_there_are_two_at_most() -> None:
     near = (100.0, 100.0, 20.0, 0.4), (110.0, 105.0, 20.0, 0.3)
-    assert len(window_corners(*boxes_of(*near), FINE_PX, SMALL_PX, THRESHOLD)) == 1
+    assert len(window_corners(*boxes_of(*near), LOOK)) == 1
     apart = [(100.0 * column, 100.0, 20.0, 0.4) for column in range(1, 6)]
-    assert len(window_corners(*boxes_of(*apart), FINE_PX, SMALL_PX, THRESHOLD)) == 2
+    assert len(window_corners(*boxes_of(*apart), LOOK)) == 2
 
 
 def test_what_the_window_shows_replaces_the_box_and_its_score() -> None:
@@ -130,7 +131,7 @@ def test_windows_of_several_images_are_not_mixed_up() -> None:
         maps = [answers((12, 12, 44, next(scores))) for _ in images]
         return [np.concatenate(each) for each in zip(*maps, strict=True)]
 
-    found = detect_again(coarse, [lambda: FINE] * 3, FINE_PX, run, SMALL_PX, THRESHOLD, 0.05, 20)
+    found = detect_again(coarse, [lambda: FINE] * 3, run, LOOK, 0.05, 20)
     assert [score.round(2).tolist() for _, score in found] == [[0.8], [], [0.75, 0.72]]
 
 
@@ -142,7 +143,7 @@ def test_low_scores_are_left_out_after_the_second_look() -> None:
 
 
 def test_images_smaller_than_a_window_are_not_looked_at_again() -> None:
-    assert window_corners(*boxes_of((10, 10, 20, 0.4)), (640, 128), SMALL_PX, THRESHOLD) == []
+    assert window_corners(*boxes_of((10, 10, 20, 0.4)), SecondLook((640, 128), SMALL_PX, THRESHOLD)) == []
 
 
 def test_the_detector_measures_small_squares_at_twice_the_scale(tmp_path: Path) -> None:
@@ -185,5 +186,5 @@ def test_boxes_that_no_window_can_show_are_refused(wrong: float) -> None:
 
 def test_below_a_high_threshold_nothing_is_certain() -> None:
     box = boxes_of((100, 100, 20, 0.75))
-    assert window_corners(*box, FINE_PX, SMALL_PX, 0.5) == []
-    assert len(window_corners(*box, FINE_PX, SMALL_PX, 0.8)) == 1
+    assert window_corners(*box, LOOK) == []
+    assert len(window_corners(*box, SecondLook(FINE_PX, SMALL_PX, 0.8))) == 1
