@@ -68,7 +68,10 @@ def disc_image_centers(
     """
     if rig.lens(eye) is None:
         return project_disc_centers(rig, left_from_drogue, centers_drogue_m, radii_m, eye)
-    outlines = disc_outline(left_from_drogue, np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m), _OUTLINE_POINTS)
+    centers, radii = np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m)
+    if len(centers) != len(radii):
+        raise ValueError(f"radii_m: {len(radii)} for {len(centers)} discs")
+    outlines = disc_outline(left_from_drogue, centers, radii, _OUTLINE_POINTS)
     return np.stack([_polygon_centroid(rig.image(outline, eye)) for outline in outlines])
 
 

@@ -60,8 +60,6 @@ Result = TypeVar("Result")
 # Sources of regions that are not a tracker's: the detector, or a prediction from the other eye.
 DETECTOR, OTHER_EYE = "detector", "other eye"
 NOT_DETECTED = NoFixReason("no drogue detected in the left image, nor in the right one")
-# For smaller boxes the handover to another thread takes as long as the work itself.
-_LEAST_THREADED_AREA_PX2 = 1e5
 CentroidChoice = Literal["own", "binary", "edge"]
 CENTROID_CHOICES: tuple[CentroidChoice, ...] = ("own", "binary", "edge")
 # The methods of the seed paper and of those that it compares itself with.
@@ -175,12 +173,7 @@ class PairNavigator:
             scale_px_per_m = max(boxes[eye][2:]) / (2 * self._rim_radius_m)
             return undistort_centroids(self._centroids_in(channel, window[:2], scale_px_per_m), self._rig, eye)
 
-        larger = max(box[2] * box[3] for box in boxes.values())
-        centroids = (
-            map_eyes(centroids_of, boxes)
-            if larger > _LEAST_THREADED_AREA_PX2
-            else {eye: centroids_of(eye) for eye in boxes}
-        )
+        centroids = map_eyes(centroids_of, boxes, max(box[2] * box[3] for box in boxes.values()))
         measured = perf_counter()
         left, right = (centroids.get(eye, NO_CENTROIDS) for eye in EYES)
         observation = correspond(left, right, self._rig, self._layout)

@@ -84,15 +84,17 @@ def marker_signals(
         ellipses: the outlines; they may reach beyond the image.
         others_weight: see `nav.matching.marker_channel.marker_channel`.
     """
+    windows = {eye: _window(ellipses.take(ellipses.eyes == index), images.size_px) for index, eye in enumerate(EYES)}
 
     def signal_of(eye: Eye) -> MarkerSignal:
-        window = _window(ellipses.take(ellipses.eyes == EYES.index(eye)), images.size_px)
+        window = windows[eye]
         mosaic = images.left_mosaic if eye == "left" else images.right_mosaic
         if color is not None and mosaic is not None:
             return _mosaic_signal(images, mosaic, window, (color, others_weight))
         return _image_signal(images, eye, window, (color, others_weight))
 
-    signals = map_eyes(signal_of, EYES)
+    areas_px2 = ((right - left) * (bottom - top) for left, top, right, bottom in windows.values())
+    signals = map_eyes(signal_of, EYES, max(areas_px2))
     return signals["left"], signals["right"]
 
 

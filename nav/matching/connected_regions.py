@@ -1,8 +1,8 @@
 """Connected regions of a mask: their boxes, areas and centres of mass.
 
-OpenCV's `connectedComponentsWithStats` gives the same numbers, and writes a label of four bytes for every pixel on the
-way, which takes some ten times as long. Here a region is a set of runs: neighbouring pixels of one row. Large masks are
-mostly empty, and eight empty pixels are skipped at a time.
+OpenCV's `connectedComponentsWithStats` gives the same regions in another order, and writes a label of four bytes for
+every pixel on the way, which takes several times as long. Here a region is a set of runs: neighbouring pixels of one
+row. Large masks are mostly empty, and eight empty pixels are skipped at a time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _EIGHT_ONES = np.uint64(0x0101010101010101)
 
 @dataclass(frozen=True, eq=False)
 class ConnectedRegions:
-    """Regions of pixels that are neighbours along an axis or a diagonal, in the order of their first runs.
+    """Regions of pixels that are neighbours along an axis or a diagonal, in the order of their first pixels by rows.
 
     Attributes:
         boxes: (M, 4) left, top, width, height. [px]

@@ -1,1 +1,1 @@
-"""Compiled loops and the least-squares solver that centroids and poses share."""
+"""Compiled loops, least squares, medians and threads that centroids, poses and tracking share."""

@@ -302,6 +302,7 @@ def _rig_mismatch(observation: Observation) -> NoFixReason | None:
 def _pairs_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of the first and of the second of all pairs of so many markers."""
     first, second = np.triu_indices(count, 1)
+    first.flags.writeable = second.flags.writeable = False
     return first, second
 
 

@@ -9,6 +9,7 @@ with online multiple instance learning", doi:10.1109/TPAMI.2010.226).
 from __future__ import annotations
 
 import ctypes
+import threading
 
 import cv2
 import numpy as np
@@ -41,6 +42,8 @@ _REACH_PX = 64.0
 # Forward-backward error beyond which a point is lost, in pixels of the region.
 _LARGEST_RETURN_ERROR = 1.0
 _LARGEST_LOG_SCALE = 0.25
+# All MIL trackers of a process share the samples that they compare, in OpenCV's `ClfMilBoost::update`.
+_MIL_LOCK = threading.Lock()
 
 
 class MedianFlowEyeTracker:
@@ -214,7 +217,8 @@ class MilEyeTracker:
             return None
         region = self._resampled(image)
         _seed_generators()
-        found, answer = self._mil.update(region.pixels)
+        with _MIL_LOCK:
+            found, answer = self._mil.update(region.pixels)
         if not found:
             return None
         x, y, width, height = answer
@@ -240,7 +244,8 @@ class MilEyeTracker:
             settings.samplerSearchWinSize = _SEARCH
             _seed_generators()
             self._mil = cv2.TrackerMIL.create(settings)
-            self._mil.init(region.pixels, (int(low[0]), int(low[1]), int(size[0]), int(size[1])))
+            with _MIL_LOCK:
+                self._mil.init(region.pixels, (int(low[0]), int(low[1]), int(size[0]), int(size[1])))
 
     def _resampled(self, image: EyeImage) -> ImageRegion:
         """The whole image on MIL's grid, in whose coordinates MIL keeps its state."""

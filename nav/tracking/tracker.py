@@ -71,7 +71,10 @@ class Tracker(Protocol):
 
 
 class EyeTracker(Protocol):
-    """Follows the drogue in the images of one eye; `locate` may be called repeatedly, `learn` once for each image."""
+    """Follows the drogue in the images of one eye; `locate` may be called repeatedly, `learn` once for each image.
+
+    `locate` of both eyes' trackers may run at the same time.
+    """
 
     def locate(self, image: EyeImage, predicted: Box | None, sd_px: float | None) -> Detection | None:
         """The box in the next image, or in the same one with a better prediction; None where it is not found.
@@ -133,14 +136,16 @@ class StereoTracker:
 
     def follow(self, images: StereoImages, predicted: StereoDetection) -> StereoDetection:
         """See `Tracker`; an eye that lost the drogue searches again where the other eye's box predicts it."""
-
-        def locate(eye: Eye) -> Detection | None:
-            prediction = predicted.of(eye)
-            box = None if prediction is None else prediction.box_xywh_px
-            is_visible = box is not None and _is_on_image(box, images.size_px)
-            return self._eyes[eye].locate(eye_image(images, eye), box if is_visible else None, None)
-
-        answers = map_eyes(locate, self._eyes) if self._eyes else {}
+        boxes = {
+            eye: found.box_xywh_px
+            for eye in self._eyes
+            if (found := predicted.of(eye)) is not None and _is_on_image(found.box_xywh_px, images.size_px)
+        }
+        answers = map_eyes(
+            lambda eye: self._eyes[eye].locate(eye_image(images, eye), boxes.get(eye), None),
+            self._eyes,
+            max((box[2] * box[3] for box in boxes.values()), default=0.0),
+        )
         consistent = self._consistent(images, _stereo_detection(answers))
         for eye, tracker in self._eyes.items():
             tracker.learn(eye_image(images, eye), consistent.of(eye))

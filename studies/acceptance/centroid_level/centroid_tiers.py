@@ -308,7 +308,7 @@ _REPEATS = 5
 
 
 def measure_speed(dataset: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
-    """Time the centroids, and single, batched and robust adjustment, on one thread.
+    """Time the centroids, and single, batched and robust adjustment, with libraries on one thread.
 
     Args:
         dataset: pairs at the distances that centroids are timed at, among others.

@@ -154,6 +154,7 @@ def test_a_turn_of_the_camera_shifts_and_turns_what_it_sees() -> None:
     turns = np.eye(3)
     by_turn = np.vstack([-np.cross(turns, at_m).T, -turns])
     own = np.diag(np.repeat(variances[:2], 3))
+    # Rounding of a few products of numbers of order one.
     np.testing.assert_allclose(
         apparent_pose_covariance(at_m, *variances), own + variances[2] * by_turn @ by_turn.T, rtol=1e-14, atol=1e-16
     )

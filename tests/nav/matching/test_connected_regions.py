@@ -52,6 +52,7 @@ def test_even_masks_and_runs_that_end_with_the_row(width: int, value: int) -> No
 def test_a_part_of_a_mask_and_a_spiral() -> None:
     whole = (np.random.default_rng(3).random((40, 50)) < 0.4).astype(np.uint8)
     check_against_opencv(whole[3:30, 5:41])
+    check_against_opencv(np.ascontiguousarray(whole[:, :47])[1:])  # begins between two words of memory
     spiral = np.zeros((41, 41), np.uint8)
     left, right, top, bottom = 0, 40, 0, 40
     while left < right:
@@ -59,3 +60,15 @@ def test_a_part_of_a_mask_and_a_spiral() -> None:
         spiral[bottom, left + 2 : right + 1], spiral[top + 4 : bottom + 1, left + 2] = 1, 1
         left, right, top, bottom = left + 2, right - 4, top + 4, bottom - 4
     check_against_opencv(spiral)
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0)])
+def test_a_mask_without_pixels_has_no_regions(shape: tuple[int, int]) -> None:
+    regions = connected_regions(np.zeros(shape, np.uint8))
+    assert regions.boxes.shape == (0, 4) and regions.centers_px.shape == (0, 2)
+
+
+def test_regions_come_row_by_row() -> None:
+    mask = np.zeros((4, 12), np.uint8)
+    mask[0, 9] = mask[1, 1] = mask[3, 5] = 1
+    assert connected_regions(mask).centers_px.tolist() == [[9, 0], [1, 1], [5, 3]]
