@@ -42,7 +42,8 @@ _REACH_PX = 64.0
 # Forward-backward error beyond which a point is lost, in pixels of the region.
 _LARGEST_RETURN_ERROR = 1.0
 _LARGEST_LOG_SCALE = 0.25
-# All MIL trackers of a process share the samples that they compare, in OpenCV's `ClfMilBoost::update`.
+# All MIL trackers of a process share the samples that they compare, in OpenCV's `ClfMilBoost::update`, and the C
+# library's generator.
 _MIL_LOCK = threading.Lock()
 
 
@@ -216,8 +217,8 @@ class MilEyeTracker:
         if self._mil is None:
             return None
         region = self._resampled(image)
-        _seed_generators()
         with _MIL_LOCK:
+            _seed_generators()
             found, answer = self._mil.update(region.pixels)
         if not found:
             return None
@@ -242,9 +243,9 @@ class MilEyeTracker:
         if size.min() >= _LEAST_SIDE and (np.array(region.size) - size).min() >= _LEAST_ROOM:
             settings = cv2.TrackerMIL.Params()
             settings.samplerSearchWinSize = _SEARCH
-            _seed_generators()
             self._mil = cv2.TrackerMIL.create(settings)
             with _MIL_LOCK:
+                _seed_generators()
                 self._mil.init(region.pixels, (int(low[0]), int(low[1]), int(size[0]), int(size[1])))
 
     def _resampled(self, image: EyeImage) -> ImageRegion:
@@ -259,7 +260,7 @@ class MilEyeTracker:
 def _seed_generators() -> None:
     """Seed the generators of MIL's features and samples, so that results do not depend on what ran before.
 
-    These are OpenCV's and the C library's, both global to the process; nothing else here uses either.
+    These are OpenCV's of this thread and the C library's of the process; nothing else here uses either.
     """
     cv2.setRNGSeed(_SEED)
     ctypes.CDLL(None).srand(_SEED)
