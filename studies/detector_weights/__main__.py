@@ -22,7 +22,7 @@ from scenes.sampler import scene_of_frame
 from studies.detector_weights.plain_grounds import write_plain_grounds
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
-from studies.world_variety.detection_by_drogue import score_by_drogue, scores_side_by_side
+from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind, scores_side_by_side
 
 _HERE = Path(__file__).parent
 # Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
@@ -114,10 +114,10 @@ def _datasets() -> dict[str, tuple[RecipeSource, Sequence[int]]]:
 def score_lines(out: Path, detectors: dict[str, Path]) -> Iterator[str]:
     """A Markdown table of scores on the test set by drogue, and how many pictures without a drogue have a box."""
     yield from scores_side_by_side(
-        {name: list(score_by_drogue(out / "test", str(path))) for name, path in detectors.items()}
+        {name: list(score_by_kind(out / "test", str(path), drogue_kind)) for name, path in detectors.items()}
     )
     for name, path in detectors.items():
-        last = list(score_by_drogue(out / "empty", str(path)))[-1]
+        last = list(score_by_kind(out / "empty", str(path), drogue_kind))[-1]
         yield f"{name}: {last.false_boxes} boxes in {last.images} images of frames without a drogue"
         boxes = out / f"photographs-{name}.json"
         words = ["--detector", path, "--mono", "--out", boxes]

@@ -14,7 +14,7 @@ import typer
 from datasets_manifest.recipe.recipe import load_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from studies.world_variety.detection_by_drogue import score_by_drogue, scores_side_by_side
+from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind, scores_side_by_side
 
 TEST_SET = Path(__file__).parents[1] / "detector_weights" / "test.toml"
 
@@ -48,7 +48,7 @@ def main(
         folders = render_by_engines(out, recipe, engine, pairs, workers)
         for name in detector or ["mobile-l", "mobile-s"]:
             print(f"\n{name}\n")
-            scores = {by: list(score_by_drogue(folder, name)) for by, folder in folders.items()}
+            scores = {by: list(score_by_kind(folder, name, drogue_kind)) for by, folder in folders.items()}
             print("\n".join(scores_side_by_side(scores)), flush=True)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from drogue_models.presets import preset_names
 from drogue_models.tankers.tanker import STATIONS
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
-from studies.world_variety.detection_by_drogue import score_by_drogue
+from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety
 
@@ -74,7 +74,7 @@ def _cells(found: Variety) -> str:
 
 def _detect(dataset: Path, detector: str) -> None:
     print("drogue | images | drogues | AP50 [%] | recall [%] | false boxes")
-    for row in score_by_drogue(dataset, detector):
+    for row in score_by_kind(dataset, detector, drogue_kind):
         shares = (("-" if share is None else f"{100 * share:.1f}") for share in (row.ap50, row.recall))
         print(f"{row.kind} | {row.images} | {row.drogues} | {' | '.join(shares)} | {row.false_boxes}")
 

@@ -1,13 +1,14 @@
-"""How well a detector finds each kind of drogue in a dataset."""
+"""How well a detector finds drogues in a dataset, by their kind or by that of the tanker."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.detection.detection_metrics import AT_50, Evaluation, operating_point
 from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
@@ -16,10 +17,10 @@ from nav.detector.detector_registry import detector_factory
 
 
 class KindScore(NamedTuple):
-    """Scores on all images that show one kind of drogue.
+    """Scores on all images of one kind.
 
     Attributes:
-        kind: `ring`, or the family of the drogue's body, and whether it has markers; `all`, or `empty` frames.
+        kind: as `drogue_kind` or `tanker_kind` names it, or `all`.
         images: number of images.
         drogues: number of drogues that count in them.
         ap50: average precision at an overlap of a half; None without drogues.
@@ -35,12 +36,13 @@ class KindScore(NamedTuple):
     false_boxes: int
 
 
-def score_by_drogue(dataset: Path, detector: str) -> Iterator[KindScore]:
-    """Scores of a detector by the kind of drogue, over all splits; the last is of all images.
+def score_by_kind(dataset: Path, detector: str, kind_of: Callable[[FrameSpec], str]) -> Iterator[KindScore]:
+    """Scores of a detector by the kind of frame, over all splits; the last is of all images.
 
     Args:
         dataset: its folder, with its truth.
         detector: name of one that ships, or an ONNX file.
+        kind_of: such as `drogue_kind` or `tanker_kind`.
 
     Raises:
         ValueError: no such dataset or detector, a detector without a threshold, or a pair that cannot be read.
@@ -53,7 +55,7 @@ def score_by_drogue(dataset: Path, detector: str) -> Iterator[KindScore]:
     if (fault := runner.faults.line()) is not None:
         raise ValueError(fault)
     records = Dataset(dataset)
-    kinds = {index: drogue_kind(records.record(index).frame.drogue) for index in records.frame_indices}
+    kinds = {index: kind_of(records.record(index).frame) for index in records.frame_indices}
     images: dict[str, list[ImageTruth]] = defaultdict(list)
     for image in truth.images:
         images[kinds[image.frame_index]].append(image)
@@ -83,9 +85,19 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
-def drogue_kind(drogue: DrogueParameters | None) -> str:
-    """Kind of the drogue that a frame shows."""
-    if drogue is None:
-        return "empty"
+def drogue_kind(frame: FrameSpec) -> str:
+    """Family of the sought drogue's body, or `ring`, and whether it has markers; `empty` without one."""
+    return "empty" if frame.drogue is None else body_kind(frame.drogue)
+
+
+def body_kind(drogue: DrogueParameters) -> str:
+    """Family of a drogue's body, or `ring`, and whether it has markers."""
     family = "ring" if drogue.body is None else drogue.body.family
     return family if drogue.marker_count else f"{family}, no markers"
+
+
+def tanker_kind(frame: FrameSpec) -> str:
+    """Type of the tanker that is in sight, `wing` for the plain wing with a pod, or `no tanker`."""
+    if frame.left_from_tanker is None:
+        return "no tanker"
+    return "wing" if frame.tanker is None else frame.tanker.type

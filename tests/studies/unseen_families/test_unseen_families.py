@@ -1,4 +1,4 @@
-"""Datasets without a family of drogues: nothing else is lost, and the corpus stays as it is."""
+"""Datasets without a family of drogues or a type of tanker: nothing else is lost, and the corpus stays as it is."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import pytest
 from datasets_manifest.storage.layout import EVENTS_FILE
 from datasets_manifest.storage.reader import Dataset
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
-from studies.unseen_drogues.__main__ import families_in, family_of, link_without, table_lines
-from studies.world_variety.detection_by_drogue import KindScore
+from scenes.sampler import sample_frame
+from studies.unseen_families.__main__ import FAMILIES, drogue_families_in, link_without, table_lines
+from studies.world_variety.detection_by_kind import KindScore
 from studies.world_variety.light_sheets import LIGHTS_RECIPE
+
+DROGUES = FAMILIES["drogue"]
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +33,13 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_pairs_without_a_family_stay_and_the_corpus_is_not_changed(corpus: Path, tmp_path: Path) -> None:
     source = Dataset(corpus)
-    families = {index: families_in(source.record(index).frame) for index in source.frame_indices}
+    families = {index: drogue_families_in(source.record(index).frame) for index in source.frame_indices}
     assert 0 < sum(seen == {"ring"} for seen in families.values()) < len(families)
     before = (source.manifest.dataset_sha256, (corpus / EVENTS_FILE).read_bytes())
     # As a run leaves it that was stopped while it linked.
     (tmp_path / "without.part" / "frames").mkdir(parents=True)
     for _ in range(2):
-        kept = Dataset(link_without(corpus, "ring", tmp_path / "without"))
+        kept = Dataset(link_without(corpus, DROGUES, "ring", tmp_path / "without"))
         assert list(kept.frame_indices) == [index for index, seen in families.items() if "ring" not in seen]
         assert all(kept.verify(index) == [] for index in kept.frame_indices)
         assert [entry.frame_index for entry in kept.manifest.frames] == list(kept.frame_indices)
@@ -47,20 +50,29 @@ def test_pairs_without_a_family_stay_and_the_corpus_is_not_changed(corpus: Path,
 
 def test_a_family_that_nobody_draws_or_that_is_everywhere_is_named(corpus: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="fuselage: choose from ring, basket, petals, ribbons, cone"):
-        link_without(corpus, "fuselage", tmp_path / "none")
+        link_without(corpus, DROGUES, "fuselage", tmp_path / "none")
     recipe = load_recipe(str(LIGHTS_RECIPE), drogue="red-8", render={"engine": "analytic"}, frames={"count": 1})
     render_dataset(recipe, tmp_path / "rings", workers=0)
     with pytest.raises(ValueError, match="rings: every pair shows a drogue of the family ring"):
-        link_without(tmp_path / "rings", "ring", tmp_path / "none")
+        link_without(tmp_path / "rings", DROGUES, "ring", tmp_path / "none")
+
+
+def test_a_frame_counts_for_the_type_of_tanker_that_is_in_sight() -> None:
+    plain = load_recipe(str(LIGHTS_RECIPE), frames={"count": 1})
+    types = [{"type": "four-jet"}, {"type": "fighter"}]
+    flown = load_recipe(str(LIGHTS_RECIPE), tanker={"variants": types}, frames={"count": 8, "scenes": 8})
+    seen = [FAMILIES["tanker"].seen_in(sample_frame(flown, index)) for index in range(8)]
+    assert {"four-jet"} in seen and {"fighter"} in seen and all(len(kinds) == 1 for kinds in seen)
+    assert FAMILIES["tanker"].seen_in(sample_frame(plain, 0)) == {"wing"}
 
 
 def test_rows_are_those_of_the_family() -> None:
     learned = [KindScore("basket", 4, 4, 0.9, 0.8, 0), KindScore("basket, no markers", 6, 7, 0.8, 0.7, 1)]
     learned += [KindScore("cone", 2, 2, 1.0, 1.0, 0), KindScore("all", 12, 13, 0.85, 0.8, 1)]
     unseen = [score._replace(ap50=None if score.kind == "cone" else (score.ap50 or 0.0) / 2) for score in learned]
-    assert list(table_lines("basket", learned, unseen)) == [
+    assert list(table_lines(DROGUES, "basket", learned, unseen)) == [
         "| basket | 4 | 4 | 90.0 % | 45.0 % |",
         "| basket, no markers | 6 | 7 | 80.0 % | 40.0 % |",
     ]
-    assert list(table_lines("cone", learned, unseen)) == ["| cone | 2 | 2 | 100.0 % | - |"]
-    assert family_of("petals, no markers") == "petals"
+    assert list(table_lines(DROGUES, "cone", learned, unseen)) == ["| cone | 2 | 2 | 100.0 % | - |"]
+    assert DROGUES.family_of("petals, no markers") == "petals"
