@@ -36,9 +36,39 @@ _MOST_MAP_BYTES = 100_000_000
 # (+x) and turns towards north (+y), the other way round: so the columns are reversed and the axes exchanged.
 _MAP_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 
+_Key = tuple[object, ...]
+# Key of the front of a feature, before that of the whole feature.
+_FRONT = "front"
+
+
+class SharedShape:
+    """A Mitsuba shape, which all scenes with such a surface have in common.
+
+    Args:
+        name: of the surface.
+        surface: gives its mesh, material and lamp.
+        mesh: the surface's own, or a part of it.
+        file: to write the mesh to.
+
+    Attributes:
+        shape: in Mitsuba.
+        paint: the reflectance that was set last, None where it is the loaded one.
+        map_bytes: size of its reflectance map.
+    """
+
+    def __init__(self, name: str, surface: Surface, mesh: trimesh.Trimesh, file: Path) -> None:
+        self.shape = _shape(name, surface, mesh, file)
+        self.paint: NDArray[Any] | None = None
+        whole = mesh is surface.painted.mesh
+        self.map_bytes = surface.reflectance.nbytes if whole and surface.uv is not None else 0
+
 
 class DrogueScene:
     """The scene of one drogue, or of other objects alone; `set_frame` sets it up for each frame.
+
+    Args:
+        surfaces: of a frame; moved ones are where they are in it.
+        shared: shapes of other scenes by `_shape_keys`.
 
     Attributes:
         scene: everything.
@@ -51,28 +81,41 @@ class DrogueScene:
         glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
         shiny_parts: ids of parts with a sheen.
         surfaces: all of the frame, in the stage's axes.
-        map_bytes: size of all reflectance maps.
+        shapes: of all surfaces and fronts of features, by `_shape_keys`.
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
-    def __init__(self, surfaces: FrameSurfaces) -> None:
+    def __init__(self, surfaces: FrameSurfaces, keys: dict[str, _Key], shared: dict[_Key, SharedShape]) -> None:
         fronts = feature_surfaces(surfaces.fixed)
         self.features_m = _corners_m(fronts.values())
         self._drogue_m = _corners_m(surface.painted.mesh for surface in surfaces.fixed.values())
+        self.shapes: dict[_Key, SharedShape] = {}
         with scratch_folder() as folder:
             file = folder / "mesh.ply"
-            shapes = {name: _shape(name, surface, surface.painted.mesh, file) for name, surface in surfaces.all.items()}
-            features = {name: _shape(name, surfaces.fixed[name], mesh, file) for name, mesh in fronts.items()}
+
+            def shape_of(key: _Key, name: str, mesh: trimesh.Trimesh) -> SharedShape:
+                self.shapes[key] = shared.get(key) or SharedShape(name, surfaces.all[name], mesh, file)
+                return self.shapes[key]
+
+            self._shape_of = {
+                name: shape_of(keys[name], name, each.painted.mesh) for name, each in surfaces.all.items()
+            }
+            features = {name: shape_of((_FRONT, *keys[name]), name, mesh).shape for name, mesh in fronts.items()}
+        # Before the scene is made of them, which otherwise would have to be made again.
+        for name, surface in surfaces.moved.items():
+            parameters = mi.traverse(self._shape_of[name].shape)
+            _set_moved(parameters, "", surface)
+            parameters.update()
+        self._placed: FrameSurfaces | None = surfaces
+        shapes = {name: found.shape for name, found in self._shape_of.items()}
         # Merging meshes would lose the parts' identity.
         self.scene = mi.load_dict({**_WATERTIGHT, **shapes, **_lights()}, optimize=False)
         self.features = mi.load_dict({**_WATERTIGHT, **features}, optimize=False)
         self.emits = any(surface.is_lamp for surface in surfaces.all.values())
-        self.map_bytes = sum(surface.reflectance.nbytes for surface in surfaces.all.values() if surface.uv is not None)
         self.shiny_parts = {surface.part_id for surface in surfaces.all.values() if surface.painted.sheen is not None}
         self._dark = {name for name, surface in surfaces.all.items() if surface.is_lamp and not surface.lights_others}
         self.glowing: Any = None
         self._parameters = mi.traverse(self.scene)
-        self._paint: dict[str, NDArray[Any]] = {}
 
     def set_frame(
         self, surfaces: FrameSurfaces, stage_from_world: RigidTransform, ambient: EnvironmentRadiance
@@ -82,8 +125,10 @@ class DrogueScene:
         self.lamp_corners_m = [surface.hull_m() for surface in surfaces.moved.values() if surface.is_lamp]
         self.uneven_parts = surfaces.uneven_parts
         self.surfaces = list(surfaces.all.values())
-        for name, surface in surfaces.moved.items():
-            self._set_moved(name, surface)
+        if surfaces is not self._placed:
+            for name, surface in surfaces.moved.items():
+                _set_moved(self._parameters, f"{name}.", surface)
+        self._placed = None
         for name, surface in surfaces.all.items():
             self._set_material(name, surface)
         self._set_lights(stage_from_world, ambient)
@@ -99,19 +144,11 @@ class DrogueScene:
             return None
         return _by_number(self.scene, lambda name: float(name not in self._dark)).astype(np.float32)
 
-    def _set_moved(self, name: str, surface: Surface) -> None:
-        mesh, pose = surface.painted.mesh, surface.axes_from_mesh
-        self._set_buffer(f"{name}.vertex_positions", pose.apply(mesh.vertices))
-        if surface.painted.smooth:
-            self._set_buffer(f"{name}.vertex_normals", pose.rotate(mesh.vertex_normals))
-        if surface.uv is not None:
-            self._set_buffer(f"{name}.vertex_texcoords", surface.uv)
-
     def _set_material(self, name: str, surface: Surface) -> None:
         """Set paint and lamp of a surface, if they are not as they were."""
-        paint = surface.reflectance
-        if not _equal(self._paint.get(name), paint):
-            self._paint[name] = paint
+        paint, shared = surface.reflectance, self._shape_of[name]
+        if not _equal(shared.paint, paint):
+            shared.paint = paint
             place = "bsdf" if surface.painted.sheen is None else "bsdf.bsdf_0"
             if paint.ndim == 3:
                 self._parameters[f"{name}.{place}.reflectance.data"] = jit_tensor(paint)
@@ -132,9 +169,20 @@ class DrogueScene:
         )
         self._parameters["sun.irradiance.value"] = mi.Color3f(ambient.beam_illuminance_lux.tolist())
 
-    def _set_buffer(self, key: str, rows: NDArray[np.float64]) -> None:
+
+def _set_moved(parameters: Any, prefix: str, surface: Surface) -> None:
+    """Set where a surface is, in parameters whose names begin with a prefix."""
+
+    def put(key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.
-        self._parameters[key] = jit_array(type(self._parameters[key]), rows.ravel())
+        parameters[prefix + key] = jit_array(type(parameters[prefix + key]), rows.ravel())
+
+    mesh, pose = surface.painted.mesh, surface.axes_from_mesh
+    put("vertex_positions", pose.apply(mesh.vertices))
+    if surface.painted.smooth:
+        put("vertex_normals", pose.rotate(mesh.vertex_normals))
+    if surface.uv is not None:
+        put("vertex_texcoords", surface.uv)
 
 
 def by_shape(scene: Any, of_part: NDArray[Any]) -> NDArray[Any]:
@@ -209,14 +257,14 @@ def _any_up(direction: NDArray[np.float64]) -> list[float]:
     return [0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]
 
 
-_Key = tuple[object, ...]
+def _shape_keys(frame: FrameSpec, surfaces: FrameSurfaces) -> dict[str, _Key]:
+    """By name, equal for surfaces of frames that can share a shape.
 
-
-def _scene_key(frame: FrameSpec, surfaces: FrameSurfaces) -> _Key:
-    """Equal for frames that can share a scene: same drogue, and same topology and kinds of surface of all objects."""
-    kinds = tuple((name, surface.kind) for name, surface in surfaces.all.items())
-    # Texture coordinates of fixed surfaces belong to the drogue and its kind of wear, whose maps are set.
-    return (frame.drogue, *kinds)
+    A fixed one has the drogue's mesh, and texture coordinates of its kind of wear, whose maps are set; of the others
+    all is set but their topology and kind.
+    """
+    fixed = {name: (frame.drogue, name, surface.kind) for name, surface in surfaces.fixed.items()}
+    return {**fixed, **{name: (name, surface.kind) for name, surface in surfaces.moved.items()}}
 
 
 class SceneCache:
@@ -229,8 +277,13 @@ class SceneCache:
         """The scene set up for this frame; built when no cached one fits."""
         stage_from_left = frame.left_from_stage_at(0.0).inverse()
         surfaces = frame_surfaces(frame, stage_from_left)
-        key = _scene_key(frame, surfaces)
-        scene = self._scenes.pop(key, None) or DrogueScene(surfaces)
+        keys = _shape_keys(frame, surfaces)
+        # Frames share a scene if they have the same drogue, and the same surfaces of the same kinds in the same order.
+        key = (frame.drogue, *keys.values())
+        scene = self._scenes.pop(key, None)
+        if scene is None:
+            shared = {each: shape for kept in self._scenes.values() for each, shape in kept.shapes.items()}
+            scene = DrogueScene(surfaces, keys, shared)
         self._scenes[key] = scene
         while len(self._scenes) > KEPT_SCENES or (len(self._scenes) > 1 and self._map_bytes() > _MOST_MAP_BYTES):
             self._scenes.popitem(last=False)
@@ -238,7 +291,8 @@ class SceneCache:
         return scene
 
     def _map_bytes(self) -> int:
-        return sum(scene.map_bytes for scene in self._scenes.values())
+        shapes = {id(shape): shape for scene in self._scenes.values() for shape in scene.shapes.values()}
+        return sum(shape.map_bytes for shape in shapes.values())
 
 
 def _shape(name: str, surface: Surface, mesh: trimesh.Trimesh, file: Path) -> Any:

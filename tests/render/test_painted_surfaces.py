@@ -19,7 +19,7 @@ from drogue_models.surface_looks import SurfaceWear
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from render.compositing import inside_one_part
-from render.engine import RenderEngine, StereoRadiance, load_engine
+from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
 from render.surfaces import frame_surfaces
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
@@ -161,6 +161,30 @@ def test_few_scenes_with_large_maps_are_kept(
     assert kept == [1, 2, 2, 2, 2]
     huge = frame_with(monkeypatch, frame, [(plate(np.full((2048, 2048, 3), 0.5)), PLACE)])
     assert scenes.scene_of(huge, ambient) is scenes.scene_of(huge, ambient)
+
+
+def test_scenes_share_shapes_and_each_frame_has_its_own_places_and_paints(
+    engine: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = SETTINGS.model_copy(update={"edge_samples_per_px": 1, "noise_over_sensor": 100.0})
+    light, dark, bright = plate(quarters()), plate(0.5 * quarters()), plate(np.full(3, 0.9))
+    aside = (bright, (0.1, 1.0, DISTANCE_M))
+    views = [[(light, (0.2, 0.0, DISTANCE_M))], [(light, PLACE)], [(dark, (0.1, 0.0, DISTANCE_M)), aside]]
+
+    def picture(view: list[tuple[PaintedMesh, tuple[float, float, float]]]) -> EyeRadiance:
+        return engine.render(frame_with(monkeypatch, frame, view), few).left
+
+    pictures = [picture(view) for view in views]
+    scenes = engine._tracer._scenes._scenes  # type: ignore[attr-defined]
+    last, before = (scenes[key] for key in list(scenes)[:-3:-1])
+    ((key, shape),) = before.shapes.items()
+    assert last.shapes[key] is shape and len(last.shapes) == 2
+    # Each was moved and painted for another one meanwhile.
+    for view, shown in zip(views, pictures, strict=True):
+        np.testing.assert_array_equal(picture(view).radiance_cd_m2, shown.radiance_cd_m2)
+    first, moved = ((shown.part_id > 0).any(axis=0) for shown in pictures[:2])
+    shift_px = 0.2 * frame.rig.camera.fx_px / DISTANCE_M
+    assert np.flatnonzero(first)[[0, -1]] - np.flatnonzero(moved)[[0, -1]] == pytest.approx(shift_px, abs=1)
 
 
 def test_only_dirt_and_bold_maps_count_as_edges_all_over(frame: FrameSpec) -> None:
