@@ -48,6 +48,8 @@ Box = tuple[float, float, float, float]
 
 # A pixel of a shrunk region is the mean of at most this many image pixels along each axis; more only cost time.
 _AVERAGED = 3
+# Up to this reduction interpolation between four pixels reads nearly all of them, in a third of the time.
+_AREA_FROM = 1.5
 # 12 bits to 8 by a square root, which makes shot noise uniform and keeps the levels of dark scenes.
 _TO_8_BIT: NDArray[np.uint8] = np.round(np.sqrt(np.arange(4096) / 4095) * 255).astype(np.uint8)
 
@@ -125,7 +127,7 @@ def image_region(image: EyeImage, window: Box, step_px: float) -> ImageRegion | 
     part_size = np.array([part.shape[1], part.shape[0]])
     size = np.maximum(1, np.round(part_size * stride / step_px)).astype(int)
     shrink_factor = part_size / size
-    flags = cv2.INTER_AREA if step_px > 1 else cv2.INTER_LINEAR
+    flags = cv2.INTER_AREA if step_px > _AREA_FROM else cv2.INTER_LINEAR
     pixels = np.asarray(cv2.resize(part, (int(size[0]), int(size[1])), interpolation=flags))
     if pixels.dtype == np.uint16:
         pixels = _TO_8_BIT[np.minimum(pixels, len(_TO_8_BIT) - 1)]
