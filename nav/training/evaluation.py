@@ -107,16 +107,31 @@ class Predictions:
     found: list[tuple[Boxes, Boxes]]
 
 
+@dataclass(frozen=True)
+class Search:
+    """How a network searches images, as the detector does that is exported from it.
+
+    Attributes:
+        size_px: (height, width) of the network's input.
+        batch_images: number of images in a batch.
+        large_from_px: boxes whose longer side is at least this come from a second pass at half the size; 0 for a single
+            pass.
+        small_below_px: boxes whose longer side is below this are looked at again at twice the scale; 0 for never.
+    """
+
+    size_px: SizePx
+    batch_images: int
+    large_from_px: float
+    small_below_px: float = 0.0
+
+
 def predict(
     network: nn.Module,
     corpus: Corpus,
     split: SplitName,
-    size_px: SizePx,
-    batch_images: int,
-    large_from_px: float,
+    search: Search,
     compute: ComputeDevice,
     advance: Callable[[], None] = lambda: None,
-    small_below_px: float = 0.0,
 ) -> Predictions:
     """Run a network on the images of both eyes of a split, without augmentation.
 
@@ -124,25 +139,21 @@ def predict(
         network: in evaluation mode.
         corpus: with the images.
         split: which of them.
-        size_px: (height, width) of the network's input.
-        batch_images: number of images in a batch.
-        large_from_px: boxes whose longer side is at least this come from a second pass at half the size, as in the
-            detector; 0 for a single pass.
+        search: how the images are searched.
         compute: device and precision.
         advance: called after each batch.
-        small_below_px: boxes whose longer side is below this are looked at again at twice the scale, as in the
-            detector; 0 for never.
     """
     members = [(int(pair), eye) for pair in corpus.split(split) for eye in (0, 1)]
-    groups = [members[start : start + batch_images] for start in range(0, len(members), batch_images)]
+    starts = range(0, len(members), search.batch_images)
+    groups = [members[start : start + search.batch_images] for start in starts]
     truth: list[Boxes] = []
     found: list[tuple[Boxes, Boxes]] = []
 
-    fine_size_px = FINE_SCALE * size_px[0], FINE_SCALE * size_px[1]
-    look = SecondLook(fine_size_px[::-1], small_below_px, DEFAULT_THRESHOLD)
+    fine_size_px = FINE_SCALE * search.size_px[0], FINE_SCALE * search.size_px[1]
+    look = SecondLook(fine_size_px[::-1], search.small_below_px, DEFAULT_THRESHOLD)
 
     def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
-        return [whole_image(corpus, pair, eye, size_px) for pair, eye in group]
+        return [whole_image(corpus, pair, eye, search.size_px) for pair, eye in group]
 
     def fine_image(pair: int, eye: int) -> Image:
         return whole_image(corpus, pair, eye, fine_size_px)[0]
@@ -154,8 +165,8 @@ def predict(
 
     for group, whole in zip(groups, prefetch_map(read, groups, threads=1, ahead=2), strict=True):
         images, boxes = zip(*whole, strict=True)
-        some = detect_multiscale(images, run, large_from_px, _MIN_SCORE, MAX_BOXES)
-        if small_below_px:
+        some = detect_multiscale(images, run, search.large_from_px, _MIN_SCORE, MAX_BOXES)
+        if search.small_below_px:
             fine = [partial(fine_image, pair, eye) for pair, eye in group]
             some = detect_again(some, fine, run, look, _MIN_SCORE, MAX_BOXES)
         found += some

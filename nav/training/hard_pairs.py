@@ -21,7 +21,7 @@ from geometry.boxes import intersection_over_union
 from geometry.se3 import Array
 from nav.training.augmentation import SMALLEST_LEARNED_FRACTION, Boxes
 from nav.training.corpus import Corpus
-from nav.training.evaluation import measure_batch_statistics, predict
+from nav.training.evaluation import Search, measure_batch_statistics, predict
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import TrainingSettings
 from nav.training.training_state import ComputeDevice, StartingWeights, starting_network
@@ -78,7 +78,7 @@ def hard_pairs(
     batch = settings.batch_images
     observer.begin(f"batches of {batch} images in which the weights at the start may fail", -(-2 * len(pairs) // batch))
     try:
-        seen = predict(network, corpus, "train", size, batch, settings.large_from_px, compute, advance)
+        seen = predict(network, corpus, "train", Search(size, batch, settings.large_from_px), compute, advance)
     finally:
         observer.end()
     smallest_px = SMALLEST_LEARNED_FRACTION * size[0]

@@ -52,7 +52,14 @@ from nav.training.drogue_cutouts import (
     pasted_rectangle,
     sample_paste,
 )
-from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
+from nav.training.evaluation import (
+    Search,
+    ValidationScores,
+    average_precision,
+    measure_batch_statistics,
+    predict,
+    to_tensor,
+)
 from nav.training.painted_shapes import paint_distractors, paint_occluders
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurves, TrainingObserver, write_tables
@@ -423,9 +430,8 @@ class Trainer:
         network = state.average.network
         measure_batch_statistics(network, self.corpus, size, self.compute)
         settings = self.settings
-        predictions = predict(
-            network, self.corpus, "val", size, settings.batch_images, settings.large_from_px, self.compute
-        )
+        search = Search(size, settings.batch_images, settings.large_from_px)
+        predictions = predict(network, self.corpus, "val", search, self.compute)
         return average_precision(predictions.truth, predictions.found)
 
     def _row(self, state: TrainingState, epoch: int, validation: ValidationScores | None) -> EpochRow:

@@ -20,6 +20,7 @@ from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
     DEFAULT_THRESHOLD,
     Predictions,
+    Search,
     ValidationScores,
     average_precision,
     best_threshold,
@@ -204,12 +205,12 @@ def _evaluate_and_export(
     size = settings.size_at(settings.steps - 1)
     # The exported files compute in float32, so they are evaluated in float32.
     exact = ComputeDevice(compute.device, bf16=False)
+    search = Search(size, settings.batch_images, settings.large_from_px, settings.small_below_px)
     for each in (network, state.average.network):
         measure_batch_statistics(each, corpus, size, exact)
 
     def predictions(split: SplitName, of: DetectorNetwork = network) -> Predictions:
-        batch, large, small = settings.batch_images, settings.large_from_px, settings.small_below_px
-        return predict(of, corpus, split, size, batch, large, exact, small_below_px=small)
+        return predict(of, corpus, split, search, exact)
 
     validation, test = predictions("val"), predictions("test")
     last_validation = predictions("val", state.average.network)

@@ -15,6 +15,7 @@ from nav.detector.onnx_detector import OnnxDetector
 from nav.detector.output_maps import STRIDES
 from nav.training.corpus import Corpus
 from nav.training.evaluation import (
+    Search,
     average_precision,
     best_threshold,
     measure_batch_statistics,
@@ -138,7 +139,7 @@ def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
     metadata = ModelMetadata(input_size_px=size_px[::-1], small_below_px=small_below_px)
     set_metadata(file, metadata)
     detector, compute = OnnxDetector(file), ComputeDevice(torch.device("cpu"), bf16=False)
-    seen = predict(network, ellipse_corpus, "train", size_px, 5, 0.0, compute, small_below_px=small_below_px)
+    seen = predict(network, ellipse_corpus, "train", Search(size_px, 5, 0.0, small_below_px), compute)
     placement = letterbox(size_px[::-1], size_px[::-1])
     number = 0
     for pair in ellipse_corpus.split("train"):
@@ -153,6 +154,6 @@ def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
                 placement.to_image(boxes), [one.box_xywh_px for one in wanted], rtol=0, atol=1e-3
             )
             number += 1
-    plain = predict(network, ellipse_corpus, "train", size_px, 5, 0.0, compute)
+    plain = predict(network, ellipse_corpus, "train", Search(size_px, 5, 0.0), compute)
     differ = [not np.array_equal(one, other) for (_, one), (_, other) in zip(seen.found, plain.found, strict=True)]
     assert any(differ) == (small_below_px > 0)

@@ -24,7 +24,14 @@ from droguekit.batch.progress import PlainProgress
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
-from nav.training.evaluation import average_precision, measure_batch_statistics, predict, to_tensor, whole_image
+from nav.training.evaluation import (
+    Search,
+    average_precision,
+    measure_batch_statistics,
+    predict,
+    to_tensor,
+    whole_image,
+)
 from nav.training.trainer import Batch, BatchMaker, is_validation_due
 from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
@@ -317,9 +324,8 @@ def test_forty_pairs_are_memorised(toy_dataset: Path, tmp_path: Path) -> None:
     state = new_state(new_network(settings), settings, compute)
     restore_state(tmp_path, state, settings, corpus.datasets)
     with limit_threads(1):
-        predictions = predict(
-            state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, compute
-        )
+        search = Search(settings.size_px, 8, settings.large_from_px)
+        predictions = predict(state.average.network, corpus, "train", search, compute)
     reached = average_precision(predictions.truth, predictions.found)
     assert reached is not None and reached.ap50 >= 0.95
 
