@@ -147,7 +147,7 @@ class HoseRanges(FrozenModel):
         banded_scene_fraction: share of scenes whose hose has painted bands.
         reflectance: of the hose's rubber.
         sheen_fraction: share of the light that the rubber's satin surface mirrors; matt at 0.
-        roughness: of the satin surface, see `SatinPaint`.
+        roughness: width of the distribution of the satin surface's facets.
     """
 
     model: Hose = Field(default="full-size", validate_default=True)

@@ -18,8 +18,9 @@ class CameraRanges(FrozenModel):
 
     Attributes:
         processed_scene_fraction: share of scenes with an image processor; the others have the sensor's own encoding.
-        grey_scene_fraction, near_infrared_scene_fraction: shares of scenes with a monochrome camera, see
-            `VideoCamera.spectrum`.
+        grey_scene_fraction: share of scenes with a grey camera.
+        near_infrared_scene_fraction: share of scenes with a near-infrared camera, whose light is estimated from the
+            three bands; with those of a grey one at most 1.
         full_well_fraction: full well and responsivity, in proportion to those of the rig's sensor; smaller pixels have
             more noise. Drawn uniformly in the logarithm.
         psf_sigma_px: point spread of the lens, with defocus. [px]
@@ -34,9 +35,12 @@ class CameraRanges(FrozenModel):
         exposure_ev: error of the exposure. [powers of 2]
         brightest_mean_fraction, contrast, black_fraction, saturation, denoise_sigma_px, kept_detail_fraction,
             denoise_threshold, sharpen, chroma_blur_px: see `ImageProcessing`.
-        jpeg_scene_fraction, jpeg_quality: share of scenes coded as JPEG, and their quality.
-        video_scene_fraction, video_quantizer: share of scenes coded as intra pictures of H.264, and their quantiser.
-        resampled_scene_fraction, resolution_fraction: share of scenes coded at a lower resolution, and which.
+        jpeg_scene_fraction: share of scenes coded as JPEG.
+        jpeg_quality: quality that the encoder of JPEG is asked for.
+        video_scene_fraction: share of scenes coded as intra pictures of H.264; with those of JPEG at most 1.
+        video_quantizer: quantiser of H.264; larger is coarser.
+        resampled_scene_fraction: share of scenes coded at a lower resolution.
+        resolution_fraction: that resolution over the sensor's.
         interlaced_scene_fraction: share of scenes of which one field is shown.
         overlay_scene_fraction: share of scenes with lines or text over the picture.
     """

@@ -21,8 +21,9 @@ class DistanceLaw(FrozenModel):
             `stations`, which takes the values of `stations_m` in turn, frame by frame.
         low_m, high_m: the law's ends; for all but `stations`. [m]
         stations_m: distances; for `stations` alone. [m]
-        edges_m, weights: ascending distances from `low_m` to `high_m`, and the share of the frames between neighbours,
-            relative to the other weights; the law holds within each bin. None for the law from end to end. [m]
+        edges_m: ascending distances from `low_m` to `high_m`, the ends of bins within each of which the law holds; None
+            for the law from end to end. [m]
+        weights: share of the frames in each bin, relative to the others; one fewer than `edges_m`.
     """
 
     law: Literal["uniform", "log-uniform", "uniform-image-size", "stations"]

@@ -110,7 +110,7 @@ class Outputs(FrozenModel):
     """Optional files besides images, part ids and records.
 
     Attributes:
-        exr: whether every pair has EXR files of radiance, depth and normals.
+        exr: whether every pair has EXR files of radiance, depth, normals and part ids.
     """
 
     exr: bool = False

@@ -231,7 +231,8 @@ class Receiver(FrozenModel):
         body_radius_m: of its nose, far behind the tip, for the bow wave; 0 for none. [m]
         nose_body_m: the tip of its nose from the left eye: forward, right, down. [m]
         attitude_sd_deg: standard deviation of each angle at low frequencies (0.05 to 0.6 Hz). [deg]
-        vibration_deg, vibration_m: standard deviation of each axis at high frequencies (8 to 40 Hz). [deg, m]
+        vibration_deg: standard deviation of each angle at high frequencies (8 to 40 Hz). [deg]
+        vibration_m: standard deviation of each axis at high frequencies. [m]
     """
 
     manoeuvres: tuple[Manoeuvre, ...] = Field(default=("docking",), min_length=1, max_length=40)

@@ -114,12 +114,12 @@ class EnvironmentMapFile(FrozenModel):
     """An image file, pinned by its hash, and its absolute light level, of which exactly one form is given.
 
     Attributes:
-        path: of an equirectangular image, `.exr` or Radiance `.hdr`, as the user wrote it; relative to `folder`
-            unless absolute.
+        path: of an equirectangular image, `.exr` or Radiance `.hdr`, as the user wrote it; relative to the
+            recipe's folder unless absolute.
         sha256: of the file.
         folder: the recipe's folder. It is not stored with a dataset, whose contents must not depend on the place where
             it was made; a frame that is read back looks in the working directory.
-        cd_m2_per_unit: luminance of pixel value 1. [cd/m2]
+        cd_m2_per_unit: luminance of pixel value 1; this or the next is to be given. [cd/m2]
         horizontal_illuminance_lux: illuminance of level ground by the image's upper half, sun included. [lux]
     """
 

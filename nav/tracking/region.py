@@ -48,7 +48,7 @@ Box = tuple[float, float, float, float]
 
 # A pixel of a shrunk region is the mean of at most this many image pixels along each axis; more only cost time.
 _AVERAGED = 3
-# Up to this reduction interpolation between four pixels reads nearly all of them, in a third of the time.
+# Up to this reduction, interpolation counts every pixel by at least half along each axis, in a quarter of the time.
 _AREA_FROM = 1.5
 # 12 bits to 8 by a square root, which makes shot noise uniform and keeps the levels of dark scenes.
 _TO_8_BIT: NDArray[np.uint8] = np.round(np.sqrt(np.arange(4096) / 4095) * 255).astype(np.uint8)

@@ -109,7 +109,7 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Search:
-    """How a network searches images, as the detector does that is exported from it.
+    """How a network searches images; with the limits of a training's settings as the detector exported from it does.
 
     Attributes:
         size_px: (height, width) of the network's input.

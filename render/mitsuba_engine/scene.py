@@ -68,7 +68,8 @@ class DrogueScene:
 
     Args:
         surfaces: of a frame; moved ones are where they are in it.
-        shared: shapes of other scenes by `_shape_keys`.
+        keys: `_shape_keys` of the surfaces.
+        shared: shapes of other scenes by their keys.
 
     Attributes:
         scene: everything.
@@ -81,7 +82,7 @@ class DrogueScene:
         glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
         shiny_parts: ids of parts with a sheen.
         surfaces: all of the frame, in the stage's axes.
-        shapes: of all surfaces and fronts of features, by `_shape_keys`.
+        shapes: of all surfaces and fronts of features, by their keys.
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
@@ -176,6 +177,8 @@ def _set_moved(parameters: Any, prefix: str, surface: Surface) -> None:
     def put(key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.
         parameters[prefix + key] = jit_array(type(parameters[prefix + key]), rows.ravel())
+        # Another scene may have put it here, and equal values are no change to the scalar variant.
+        parameters.set_dirty(prefix + key)
 
     mesh, pose = surface.painted.mesh, surface.axes_from_mesh
     put("vertex_positions", pose.apply(mesh.vertices))
@@ -274,7 +277,10 @@ class SceneCache:
         self._scenes: OrderedDict[_Key, DrogueScene] = OrderedDict()
 
     def scene_of(self, frame: FrameSpec, ambient: EnvironmentRadiance) -> DrogueScene:
-        """The scene set up for this frame; built when no cached one fits."""
+        """The scene set up for this frame; built when no cached one fits.
+
+        It is valid until the next call, which may move or paint what both scenes show.
+        """
         stage_from_left = frame.left_from_stage_at(0.0).inverse()
         surfaces = frame_surfaces(frame, stage_from_left)
         keys = _shape_keys(frame, surfaces)
@@ -282,8 +288,10 @@ class SceneCache:
         key = (frame.drogue, *keys.values())
         scene = self._scenes.pop(key, None)
         if scene is None:
-            shared = {each: shape for kept in self._scenes.values() for each, shape in kept.shapes.items()}
-            scene = DrogueScene(surfaces, keys, shared)
+            # Nothing else holds the shapes of a scene that is dropped below.
+            scene = DrogueScene(
+                surfaces, keys, {each: shape for kept in self._scenes.values() for each, shape in kept.shapes.items()}
+            )
         self._scenes[key] = scene
         while len(self._scenes) > KEPT_SCENES or (len(self._scenes) > 1 and self._map_bytes() > _MOST_MAP_BYTES):
             self._scenes.popitem(last=False)

@@ -97,7 +97,7 @@ def body_kind(drogue: DrogueParameters) -> str:
 
 
 def tanker_kind(frame: FrameSpec) -> str:
-    """Type of the tanker that is in sight, `wing` for the plain wing with a pod, or `no tanker`."""
+    """Type of the frame's tanker, in the picture or not; `wing` for the plain wing with a pod, or `no tanker`."""
     if frame.left_from_tanker is None:
         return "no tanker"
     return "wing" if frame.tanker is None else frame.tanker.type

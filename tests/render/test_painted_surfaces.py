@@ -25,6 +25,7 @@ from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from tests.support.painted_plate import DISTANCE_M, QUARTERS, frame_with, plate, quarter_means, quarters
 from tests.support.recipe_builder import paper_view_recipe
+from tests.support.shared_shapes import pictures_in_both_orders
 
 RECIPE = paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
 SETTINGS: RenderSettings = RECIPE.render.model_copy(update={"surround_samples_per_px": 16})
@@ -168,8 +169,8 @@ def test_scenes_share_shapes_and_each_frame_has_its_own_places_and_paints(
 ) -> None:
     few = SETTINGS.model_copy(update={"edge_samples_per_px": 1, "noise_over_sensor": 100.0})
     light, dark, bright = plate(quarters()), plate(0.5 * quarters()), plate(np.full(3, 0.9))
-    aside = (bright, (0.1, 1.0, DISTANCE_M))
-    views = [[(light, (0.2, 0.0, DISTANCE_M))], [(light, PLACE)], [(dark, (0.1, 0.0, DISTANCE_M)), aside]]
+    right, aside = (0.2, 0.0, DISTANCE_M), (bright, (0.1, 1.0, DISTANCE_M))
+    views = [[(light, right)], [(light, PLACE)], [(dark, right), aside]]
 
     def picture(view: list[tuple[PaintedMesh, tuple[float, float, float]]]) -> EyeRadiance:
         return engine.render(frame_with(monkeypatch, frame, view), few).left
@@ -179,12 +180,25 @@ def test_scenes_share_shapes_and_each_frame_has_its_own_places_and_paints(
     last, before = (scenes[key] for key in list(scenes)[:-3:-1])
     ((key, shape),) = before.shapes.items()
     assert last.shapes[key] is shape and len(last.shapes) == 2
-    # Each was moved and painted for another one meanwhile.
+    # Each was moved and painted for another one meanwhile; the first finds its plate in its place, but painted.
     for view, shown in zip(views, pictures, strict=True):
         np.testing.assert_array_equal(picture(view).radiance_cd_m2, shown.radiance_cd_m2)
     first, moved = ((shown.part_id > 0).any(axis=0) for shown in pictures[:2])
     shift_px = 0.2 * frame.rig.camera.fx_px / DISTANCE_M
     assert np.flatnonzero(first)[[0, -1]] - np.flatnonzero(moved)[[0, -1]] == pytest.approx(shift_px, abs=1)
+
+
+def test_one_drogue_in_two_conditions_is_drawn_alike_in_any_order(engine: RenderEngine) -> None:
+    pairs = pictures_in_both_orders(engine)
+    scenes = list(engine._tracer._scenes._scenes.values())  # type: ignore[attr-defined]
+    # All but the two lamps of which each scene lacks one, and their fronts.
+    assert len(scenes[-1].shapes.keys() & scenes[-2].shapes.keys()) == len(scenes[-1].shapes) - 2
+    for one, other in pairs:
+        np.testing.assert_array_equal(one.part_id, other.part_id)
+        np.testing.assert_array_equal(one.radiance_cd_m2, other.radiance_cd_m2)
+    # The conditions and places are not one.
+    seen = [one.radiance_cd_m2 for one, _ in pairs]
+    assert all(not np.array_equal(seen[i], seen[j]) for i in range(4) for j in range(i))
 
 
 def test_only_dirt_and_bold_maps_count_as_edges_all_over(frame: FrameSpec) -> None:

@@ -16,7 +16,7 @@ def spot(x: float, y: float, sigma: float, bits: int = 8) -> EyeImage:
     return EyeImage(np.stack([pixels] * 3, axis=-1), 0.0)
 
 
-@pytest.mark.parametrize("step_px", [0.5, 1.0, 1.7, 4.0, 9.3])
+@pytest.mark.parametrize("step_px", [0.5, 1.0, 1.1, 1.4, 1.7, 4.0, 9.3])
 def test_resampling_keeps_a_spot_in_place(step_px: float) -> None:
     region = image_region(spot(217.3, 140.8, 20), (100, 40, 230, 210), step_px)
     assert region is not None

@@ -134,6 +134,26 @@ def test_radiance_agrees(both: dict[str, tuple[str, list[StereoRadiance]]]) -> N
             assert np.abs(a.coverage - b.coverage).mean() < 0.005
 
 
+SHARED = """
+import pickle, sys
+sys.path.insert(0, sys.argv[1])
+from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
+from tests.support.shared_shapes import pictures_in_both_orders
+engine = MitsubaEngine()
+assert "scalar" in engine.version
+pickle.dump(pictures_in_both_orders(engine), open(sys.argv[2], "wb"))
+"""
+
+
+def test_scenes_that_share_shapes_do_not_change_each_other(tmp_path: Path, pytestconfig: pytest.Config) -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed")
+    command = [sys.executable, "-c", SHARED, str(pytestconfig.rootpath), str(tmp_path / "seen.pickle")]
+    subprocess.run(command, check=True, env={**os.environ, "DRJIT_LIBLLVM_PATH": "/nonexistent/libLLVM.so"})
+    for one, other in pickle.loads((tmp_path / "seen.pickle").read_bytes()):
+        np.testing.assert_array_equal(one.part_id, other.part_id)
+        np.testing.assert_array_equal(one.radiance_cd_m2, other.radiance_cd_m2)
+
+
 HIDDEN_LAMPS = """
 import pickle, sys
 import numpy as np

@@ -53,6 +53,8 @@ def test_a_family_that_nobody_draws_or_that_is_everywhere_is_named(corpus: Path,
         link_without(corpus, DROGUES, "fuselage", tmp_path / "none")
     recipe = load_recipe(str(LIGHTS_RECIPE), drogue="red-8", render={"engine": "analytic"}, frames={"count": 1})
     render_dataset(recipe, tmp_path / "rings", workers=0)
+    with pytest.raises(ValueError, match="corpus: no pair shows a drogue of the family cone"):
+        link_without(corpus, DROGUES, "cone", tmp_path / "none")
     with pytest.raises(ValueError, match="rings: every pair shows a drogue of the family ring"):
         link_without(tmp_path / "rings", DROGUES, "ring", tmp_path / "none")
 
@@ -76,3 +78,9 @@ def test_rows_are_those_of_the_family() -> None:
     ]
     assert list(table_lines(DROGUES, "cone", learned, unseen)) == ["| cone | 2 | 2 | 100.0 % | - |"]
     assert DROGUES.family_of("petals, no markers") == "petals"
+    tankers = [
+        score._replace(kind=kind) for score, kind in zip(learned, ("fighter", "four-jet", "wing", "all"), strict=True)
+    ]
+    assert list(table_lines(FAMILIES["tanker"], "four-jet", tankers, tankers)) == [
+        "| four-jet | 6 | 7 | 80.0 % | 80.0 % |"
+    ]
