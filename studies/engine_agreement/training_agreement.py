@@ -12,7 +12,7 @@ import typer
 
 from studies.engine_agreement.detection_agreement import render_by_engines
 from studies.short_training import train_briefly
-from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind, scores_side_by_side
+from studies.world_variety.detection_by_kind import drogue_kind, percent, score_by_kind, scores_side_by_side
 
 
 def main(
@@ -34,7 +34,10 @@ def main(
                 found = train_briefly(folder, out / f"{name}-seed-{each}", out / "cache", image_passes, each)
                 scores[f"by {name}"] = list(score_by_kind(test, str(found), drogue_kind))
             print(f"\nseed {each}\n")
-            print("\n".join(scores_side_by_side(scores)), flush=True)
+            print("\n".join(scores_side_by_side(scores)))
+            print(
+                "AP of all:", ", ".join(f"{name} {percent(rows[-1].ap)}" for name, rows in scores.items()), flush=True
+            )
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error

@@ -20,7 +20,14 @@ from drogue_models.tankers.tanker import TankerType
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from studies.short_training import train_briefly
-from studies.world_variety.detection_by_kind import KindScore, body_kind, drogue_kind, score_by_kind, tanker_kind
+from studies.world_variety.detection_by_kind import (
+    KindScore,
+    body_kind,
+    drogue_kind,
+    percent,
+    score_by_kind,
+    tanker_kind,
+)
 
 EVERYTHING = "everything"
 
@@ -108,13 +115,9 @@ def table_lines(
     for learned, unseen in zip(everything, without, strict=True):
         if families.family_of(learned.kind) == family:
             yield (
-                f"| {learned.kind} | {learned.images} | {learned.drogues} | {_percent(learned.ap50)} "
-                f"| {_percent(unseen.ap50)} |"
+                f"| {learned.kind} | {learned.images} | {learned.drogues} | {percent(learned.ap50)} "
+                f"| {percent(unseen.ap50)} |"
             )
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def main(

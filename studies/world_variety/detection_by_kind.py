@@ -23,6 +23,7 @@ class KindScore(NamedTuple):
         kind: as `drogue_kind` or `tanker_kind` names it, or `all`.
         images: number of images.
         drogues: number of drogues that count in them.
+        ap: average precision, mean over overlaps from a half to 0.95; None without drogues.
         ap50: average precision at an overlap of a half; None without drogues.
         recall: at the detector's threshold; None without drogues.
         false_boxes: number of boxes from the threshold on that are on no drogue.
@@ -31,6 +32,7 @@ class KindScore(NamedTuple):
     kind: str
     images: int
     drogues: int
+    ap: float | None
     ap50: float | None
     recall: float | None
     false_boxes: int
@@ -63,8 +65,8 @@ def score_by_kind(dataset: Path, detector: str, kind_of: Callable[[FrameSpec], s
         matches = evaluation.matches(some)
         point = operating_point(matches, runner.score_threshold)
         false_boxes = int(((matches.score >= runner.score_threshold) & ~matches.is_true[AT_50]).sum())
-        ap50 = evaluation.average_precision(some).ap50
-        yield KindScore(kind, len(some), matches.drogues, ap50, point.recall, false_boxes)
+        precision = evaluation.average_precision(some)
+        yield KindScore(kind, len(some), matches.drogues, precision.ap, precision.ap50, point.recall, false_boxes)
 
 
 def scores_side_by_side(scores: Mapping[str, Sequence[KindScore]]) -> Iterator[str]:
@@ -77,11 +79,12 @@ def scores_side_by_side(scores: Mapping[str, Sequence[KindScore]]) -> Iterator[s
     yield f"| drogue | images | drogues |{heads}"
     yield f"|---|---|---|{'---|---|' * len(scores)}"
     for rows in zip(*scores.values(), strict=True):
-        cells = "".join(f" {_percent(row.ap50)}, {_percent(row.recall)} | {row.false_boxes} |" for row in rows)
+        cells = "".join(f" {percent(row.ap50)}, {percent(row.recall)} | {row.false_boxes} |" for row in rows)
         yield f"| {rows[0].kind} | {rows[0].images} | {rows[0].drogues} |{cells}"
 
 
-def _percent(share: float | None) -> str:
+def percent(share: float | None) -> str:
+    """A share as text; a dash where it is not known."""
     return "-" if share is None else f"{100 * share:.1f} %"
 
 

@@ -69,8 +69,8 @@ def test_a_frame_counts_for_the_type_of_tanker_that_is_in_sight() -> None:
 
 
 def test_rows_are_those_of_the_family() -> None:
-    learned = [KindScore("basket", 4, 4, 0.9, 0.8, 0), KindScore("basket, no markers", 6, 7, 0.8, 0.7, 1)]
-    learned += [KindScore("cone", 2, 2, 1.0, 1.0, 0), KindScore("all", 12, 13, 0.85, 0.8, 1)]
+    learned = [KindScore("basket", 4, 4, 0.5, 0.9, 0.8, 0), KindScore("basket, no markers", 6, 7, 0.4, 0.8, 0.7, 1)]
+    learned += [KindScore("cone", 2, 2, 0.6, 1.0, 1.0, 0), KindScore("all", 12, 13, 0.5, 0.85, 0.8, 1)]
     unseen = [score._replace(ap50=None if score.kind == "cone" else (score.ap50 or 0.0) / 2) for score in learned]
     assert list(table_lines(DROGUES, "basket", learned, unseen)) == [
         "| basket | 4 | 4 | 90.0 % | 45.0 % |",
