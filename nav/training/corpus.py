@@ -380,8 +380,8 @@ def open_corpus(
         photographs: folder of pictures without a drogue, or None.
 
     Raises:
-        ValueError: no datasets, one twice, one without a whole pair, no drogue, images of different sizes, or
-            no split to train on, or a photograph that cannot be read; the message names the path.
+        ValueError: no datasets, one twice, one without a whole pair, none with a drogue, images of different sizes,
+            or no split to train on, or a photograph that cannot be read; the message names the path.
         OSError: the cache cannot be written.
         KeyboardInterrupt: `should_stop` returned true.
     """
@@ -398,7 +398,8 @@ def open_corpus(
         if (line := caches[-1].faults.line()) is not None:
             fault = fault or f"{dataset.path}: {line}"
             observer.say(f"{dataset.path}: {line}")
-        if not any(box is not None for pair in caches[-1].pairs for box in pair.boxes):
+        has_boxes = any(box is not None for pair in caches[-1].pairs for box in pair.boxes)
+        if not has_boxes and not _is_without_drogue(dataset):
             raise ValueError(f"{dataset.path}: shows no drogue in any image; there is nothing to learn from")
     stamps = tuple(
         DatasetStamp(dataset.manifest.name, dataset.manifest.dataset_sha256, dataset.manifest.manifest_sha256)
@@ -424,8 +425,6 @@ def _open_datasets(paths: Sequence[Location]) -> list[Dataset]:
         if manifest.dataset_sha256 in of_hash:
             raise ValueError(f"{dataset.path}: is the same dataset as {of_hash[manifest.dataset_sha256]}; name it once")
         of_hash[manifest.dataset_sha256] = dataset.path
-        if all(entry.empty for entry in manifest.frames):
-            raise ValueError(f"{dataset.path}: has no pair with a drogue; there is nothing to learn from")
         # Focal lengths may differ: a network sees only how large a drogue is in pixels.
         first, camera = datasets[0].manifest.recipe.rig.camera, manifest.recipe.rig.camera
         if (camera.width_px, camera.height_px) != (first.width_px, first.height_px):
@@ -435,4 +434,11 @@ def _open_datasets(paths: Sequence[Location]) -> list[Dataset]:
             )
     if not any(entry.split == "train" for dataset in datasets for entry in dataset.manifest.frames):
         raise ValueError(f"{paths[0]}: has no pair in the split train; give the recipe `[split] train` above 0")
+    if all(_is_without_drogue(dataset) for dataset in datasets):
+        raise ValueError(f"{datasets[0].path}: has no pair with a drogue; there is nothing to learn from")
     return datasets
+
+
+def _is_without_drogue(dataset: Dataset) -> bool:
+    """Whether no frame shows a drogue: such a dataset shows what is none, beside others that have some."""
+    return all(entry.empty for entry in dataset.manifest.frames)

@@ -156,7 +156,7 @@ def test_datasets_without_anything_to_learn_from_are_refused(split_dataset: Path
         open_small([split_dataset, other], tmp_path / "cache")
     empty = render_toy(tmp_path / "empty", frames={"count": 2, "scenes": 1, "empty_fraction": 1.0})
     with pytest.raises(ValueError, match="empty: has no pair with a drogue"):
-        open_small([split_dataset, empty], tmp_path / "cache")
+        open_small([empty], tmp_path / "cache")
     untaught = render_toy(tmp_path / "untaught", frames=two, split={"train": 0.0, "val": 0.0, "test": 1.0})
     with pytest.raises(ValueError, match="untaught: has no pair in the split train"):
         open_small([untaught], tmp_path / "cache")
@@ -164,6 +164,14 @@ def test_datasets_without_anything_to_learn_from_are_refused(split_dataset: Path
         open_small([split_dataset, split_dataset], tmp_path / "cache")
     with pytest.raises(ValueError, match="datasets: none given"):
         open_small([], tmp_path / "cache")
+
+
+def test_a_dataset_without_any_drogue_teaches_beside_others(split_dataset: Path, tmp_path: Path) -> None:
+    empty = render_toy(tmp_path / "empty", frames={"count": 2, "scenes": 1, "empty_fraction": 1.0})
+    corpus = open_small([split_dataset, empty], tmp_path / "cache")
+    assert len(corpus.places) == 10
+    assert not any(len(corpus.boxes(pair, eye)) for pair in (8, 9) for eye in (0, 1))
+    np.testing.assert_array_equal(corpus.image(0, 0), open_small([split_dataset], tmp_path / "cache").image(0, 0))
 
 
 def test_several_datasets_form_one_sequence_of_pairs(split_dataset: Path, tmp_path: Path) -> None:
