@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.pose.adjustment_loops import SharedInputs, adjust_frames, linearise_frames, predict_centers
+from nav.pose.adjustment_loops import (
+    SharedInputs,
+    adjust_frames,
+    invert_information,
+    linearise_frames,
+    predict_centers,
+)
 from nav.pose.features import Features
 
 
@@ -90,7 +96,7 @@ def linearise(features: Features, state: AdjustmentState, loss: Loss = SQUARED_L
     result = Linearised(
         jacobian=np.empty((count, 6 + departure_count, rows)), residuals=np.empty((count, rows)), costs=np.empty(count)
     )
-    unknowns = (_contiguous(state.rotations), _contiguous(state.translations_m), _contiguous(state.departures))
+    unknowns = (contiguous(state.rotations), contiguous(state.translations_m), contiguous(state.departures))
     outputs = (result.jacobian, result.residuals, result.costs)
     linearise_frames(shared_inputs(features, loss), *frame_inputs(features), *unknowns, *outputs)
     return result
@@ -99,7 +105,7 @@ def linearise(features: Features, state: AdjustmentState, loss: Loss = SQUARED_L
 def project_features(features: Features, rotations: Array, translations_m: Array) -> Array:
     """(S, E, F, 2) predicted ellipse centres of the nominal drogue in poses. [px]"""
     pixels = np.empty((len(rotations), len(features.eye_x_m), len(features.points_m), 2))
-    predict_centers(shared_inputs(features, SQUARED_LOSS), _contiguous(rotations), _contiguous(translations_m), pixels)
+    predict_centers(shared_inputs(features, SQUARED_LOSS), contiguous(rotations), contiguous(translations_m), pixels)
     return pixels
 
 
@@ -111,10 +117,10 @@ def shared_inputs(features: Features, loss: Loss) -> SharedInputs:
         fy_px=float(camera.fy_px),
         cx_px=float(camera.cx_px),
         cy_px=float(camera.cy_px),
-        eye_x_m=_contiguous(features.eye_x_m),
-        points_m=_contiguous(features.points_m),
-        radii_m=_contiguous(features.radii_m),
-        shifts_m=_contiguous(features.shifts_m),
+        eye_x_m=contiguous(features.eye_x_m),
+        points_m=contiguous(features.points_m),
+        radii_m=contiguous(features.radii_m),
+        shifts_m=contiguous(features.shifts_m),
         disparity_sigma_px=float(features.disparity_sigma_px),
         huber_sigmas=float(loss.huber_sigmas),
         tilt_prior_rad=float(loss.tilt_prior_rad),
@@ -126,13 +132,13 @@ def frame_inputs(features: Features) -> tuple[Array, Array]:
     coupling = features.coupling
     if coupling is None:
         coupling = np.empty((4, features.frames, 0))
-    return _contiguous(features.measured), _contiguous(coupling)
+    return contiguous(features.measured), contiguous(coupling)
 
 
-def _contiguous(array: Array) -> Array:
+def contiguous(array: Array) -> Array:
     """The array as C-contiguous and writeable; the loops would be compiled anew for any other kind of array."""
-    plain: Array = np.require(array, requirements=["C", "W"])
-    return plain
+    # `numpy.require` takes ten times as long to find that nothing is to be done.
+    return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,16 +199,6 @@ def inverse_information(information: Array) -> tuple[Array, NDArray[np.bool_]]:
         (S, 6, 6) covariances, and (S,) whether the measurements determine the whole pose; the covariance is zero where
         they do not.
     """
-    # Eigenvalues are compared after scaling, since metres and radians differ in size.
-    diagonal = np.diagonal(information, axis1=1, axis2=2)
-    determined = (np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1))[:, None]
-    scale = np.sqrt(np.where(determined, diagonal, 1.0))
-    scale_product = scale[:, :, None] * scale[:, None, :]
-    values, vectors = np.linalg.eigh(
-        np.where(determined[..., None], information / scale_product, np.eye(information.shape[1]))
-    )
-    determined = determined[:, 0] & (values[:, 0] > np.finfo(np.float64).eps)
-    inverse = (
-        (vectors / np.where(determined, values.T, np.inf).T[:, None, :]) @ np.swapaxes(vectors, 1, 2) / scale_product
-    )
-    return inverse[:, :6, :6], determined
+    covariances, determined = np.empty((len(information), 6, 6)), np.empty(len(information), np.bool_)
+    invert_information(contiguous(information), covariances, determined)
+    return covariances, determined

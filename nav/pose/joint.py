@@ -13,7 +13,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from drogue_models.marker_layout import MarkerLayout
@@ -41,15 +40,12 @@ from nav.pose.pose_method import (
     hub_fault,
     stereo_fault,
 )
+from nav.pose.tilt_pairs import TiltPairs, line_of_sight_rotations, mixture_mean, mode_weights, two_fold_starts
 
 # Standard deviation of pitch and of yaw for drogues that swing uniformly within 10 degrees: 5.8 degrees.
 TILT_PRIOR_RAD = np.radians(6.0)
 # The sign of a tilt is reliable beyond this many standard deviations of the tilt of a frontal drogue: wrong in 0.1 %.
 RELIABLE_SIGMAS = 3.0
-# Starts that end closer to each other than this found one minimum.
-_SAME_TURN_RAD = 1e-4
-# Keeps the affine fit of collinear markers solvable; negligible for all others.
-_RIDGE_FRACTION = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,142 +142,6 @@ def adjust_both_tilts(
     return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
 
 
-def two_fold_starts(features: Features) -> tuple[Array, Array]:
-    """Both weak-perspective poses of the ring's markers that every eye measured.
-
-    The affine map from the rim plane to the image, averaged over the eyes, is scale times the first two columns of the
-    attitude without their third components. The common sign of these is undetermined, hence two poses.
-
-    Args:
-        features: B frames with at least three markers that all eyes measured, and that are not collinear.
-
-    Returns:
-        rotations (B, 2, 3, 3) `left_from_drogue`, translations (B, 2, 3). [m]
-    """
-    camera = features.camera
-    linear_px, center_px = _fit_affine_maps(features)
-    # Rays with z = 1: the affine map in units of the focal length.
-    linear = linear_px / np.array([camera.fx_px, camera.fy_px])[:, None]
-    direction = camera.rays(center_px)
-    scale = _largest_singular_values(linear)
-    # Coincident markers have no scale; any value works, since the cost of the adjustment is high anyway.
-    scale = np.maximum(scale, np.finfo(np.float64).tiny ** 0.5)
-    translation = direction / scale[:, None]
-    translation[:, 0] += features.eye_x_m.mean()
-
-    columns = np.empty((len(scale), 2, 3, 2))
-    columns[:, :, :2] = (linear / scale[:, None, None])[:, None]
-    in_plane = columns[:, 0, :2]
-    third = np.sqrt(np.maximum(0.0, 1 - (in_plane**2).sum(axis=1)))
-    third[:, 1] = -np.copysign(
-        third[:, 1], in_plane[:, 0, 0] * in_plane[:, 0, 1] + in_plane[:, 1, 0] * in_plane[:, 1, 1]
-    )
-    columns[:, 0, 2], columns[:, 1, 2] = third, -third
-    rotations = line_of_sight_rotations(direction)[:, None] @ _nearest_rotations(columns)
-    return rotations, np.repeat(translation[:, None], 2, axis=1)
-
-
-def line_of_sight_rotations(directions: Array) -> Array:
-    """(B, 3, 3) smallest rotations from the optical axis to (B, 3) directions with positive z."""
-    line_of_sight = directions / np.sqrt((directions**2).sum(axis=1, keepdims=True))
-    x, y, z = line_of_sight.T
-    rotations = np.empty((len(line_of_sight), 3, 3))
-    rotations[:, :, 2] = line_of_sight
-    rotations[:, 2, 0], rotations[:, 2, 1] = -x, -y
-    rotations[:, 0, 0], rotations[:, 1, 1] = 1 - x * x / (1 + z), 1 - y * y / (1 + z)
-    rotations[:, 0, 1] = rotations[:, 1, 0] = -x * y / (1 + z)
-    return rotations
-
-
-def _fit_affine_maps(features: Features) -> tuple[Array, Array]:
-    """Affine maps from rim plane to mean image: (B, 2, 2) linear parts, (B, 2) images of the drogue's origin. [px]"""
-    paired = (features.seen.all(axis=1) & features.is_marker).astype(np.float64)
-    cyclopean = features.measured[:2].mean(axis=2).transpose(1, 2, 0)
-    total = np.maximum(paired.sum(axis=1), 1)[:, None]
-    positions = features.points_m[:, :2]
-    mean_position = paired @ positions / total
-    mean_px = (paired[..., None] * cyclopean).sum(axis=1) / total
-    centred = (positions - mean_position[:, None]) * paired[..., None]
-    normal = centred.transpose(0, 2, 1) @ centred
-    ridge = _RIDGE_FRACTION * (normal[:, 0, 0] + normal[:, 1, 1]) + np.finfo(np.float64).tiny
-    normal += ridge[:, None, None] * np.eye(2)
-    moments = centred.transpose(0, 2, 1) @ (cyclopean - mean_px[:, None])
-    linear = np.linalg.solve(normal, moments).transpose(0, 2, 1)
-    return linear, mean_px - (linear @ mean_position[..., None])[..., 0]
-
-
-def _nearest_rotations(columns: Array) -> Array:
-    """(..., 3, 3) rotations whose first two columns are nearest to two nearly orthonormal ones (..., 3, 2)."""
-    rotations = np.empty((*columns.shape[:-1], 3))
-    u, _, vt = np.linalg.svd(columns, full_matrices=False)
-    np.matmul(u, vt, out=rotations[..., :2])
-    rotations[..., 2] = cross(rotations[..., 0], rotations[..., 1])
-    return rotations
-
-
-def cross(first: Array, second: Array) -> Array:
-    """(..., 3) cross products; for small arrays several times as fast as `numpy.cross`."""
-    ax, ay, az, bx, by, bz = (vectors[..., axis] for vectors in (first, second) for axis in range(3))
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
-
-
-def _largest_singular_values(linear: Array) -> Array:
-    """(B,) largest singular values of (B, 2, 2) maps."""
-    (a, b), (c, d) = linear.transpose(1, 2, 0)
-    singular_values: Array = (np.hypot(a + d, b - c) + np.hypot(a - d, b + c)) / 2
-    return singular_values
-
-
-@dataclass(frozen=True, eq=False)
-class TiltPairs:
-    """Adjusted poses from both starts of B frames, (B, 2, ...)."""
-
-    rotations: Array
-    translations_m: Array
-    costs: Array
-    information: Array
-
-    @staticmethod
-    def of(adjusted: AdjustedPoses) -> TiltPairs:
-        """The pairs among 2 B poses, the two of a frame after each other."""
-        size = adjusted.information.shape[-1]
-        return TiltPairs(
-            adjusted.rotations.reshape(-1, 2, 3, 3),
-            adjusted.translations_m.reshape(-1, 2, 3),
-            adjusted.costs.reshape(-1, 2),
-            adjusted.information.reshape(-1, 2, size, size),
-        )
-
-    def ordered(self, order: NDArray[np.int64]) -> TiltPairs:
-        """The pairs with their members in (B, 2) orders."""
-        rows = np.arange(len(order))[:, None]
-        return TiltPairs(*(values[rows, order] for values in vars(self).values()))
-
-    def replace(self, frames: NDArray[np.int64], other: TiltPairs) -> None:
-        """Put the pairs of other poses in the places of these frames."""
-        for own, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
-            own[frames] = replacement
-
-
-def mode_weights(pairs: TiltPairs, prior_rad: float) -> Array:
-    """(B, 2) posterior probabilities by Laplace's approximation, `exp(-cost) |information|^(-1/2)` times a tilt prior.
-
-    They are zero for a pose behind the cameras and for the second of two equal poses.
-    """
-    axes = pairs.rotations[..., 2]
-    with np.errstate(invalid="ignore"):
-        log_weights = -pairs.costs - np.linalg.slogdet(pairs.information)[1] / 2
-    log_weights -= (axes[..., :2] ** 2).sum(axis=-1) / (2 * prior_rad**2)
-    possible = np.isfinite(log_weights) & (axes[..., 2] > 0) & (pairs.translations_m[..., 2] > 0)
-    possible[:, 1] &= np.linalg.norm(axes[:, 0] - axes[:, 1], axis=-1) > _SAME_TURN_RAD
-    # A frame with only impossible poses keeps the first, which is not sound.
-    possible[:, 0] |= ~possible.any(axis=1)
-    log_weights = np.where(possible, np.where(np.isfinite(log_weights), log_weights, 0.0), -np.inf)
-    relative = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-    weights: Array = relative / relative.sum(axis=1, keepdims=True)
-    return weights
-
-
 def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Array) -> NDArray[np.bool_]:
     """(B,) whether the tilt against the line of sight exceeds three standard deviations of that of a frontal pose."""
     middle = np.array([features.eye_x_m.mean(), 0.0, 0.0])
@@ -289,26 +149,10 @@ def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Ar
     covariance, determined = inverse_information(information_at(features, frontal, translations_m))
     variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
     # The cosine of small tilts is lost in rounding; the cross product is not.
-    tilt = np.sqrt((cross(rotations[:, :, 2], frontal[:, :, 2]) ** 2).sum(axis=1))
+    ax, ay, az, bx, by, bz = (axes[:, k, 2] for axes in (rotations, frontal) for k in range(3))
+    tilt = np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
     reliable: NDArray[np.bool_] = determined & (tilt > RELIABLE_SIGMAS * np.sqrt(variance))
     return reliable
-
-
-def mixture_mean(pairs: TiltPairs, weights: Array) -> tuple[Array, Array, Array]:
-    """Mean rotations (B, 3, 3), translations (B, 3) and covariances (B, 6, 6) of mixtures of two Gaussians."""
-    count, size = len(weights), pairs.information.shape[-1]
-    first = pairs.rotations[:, 0]
-    turn_between = Rotation.from_matrix(pairs.rotations[:, 1] @ np.swapaxes(first, 1, 2)).as_rotvec()
-    turn = np.zeros((count, 2, 3))
-    turn[:, 1] = np.where(weights[:, 1:] > 0, turn_between, 0.0)
-    positions = np.concatenate([pairs.translations_m, turn], axis=-1)
-    mean = (weights[..., None] * positions).sum(axis=1)
-    offsets = np.where(weights[..., None] > 0, positions - mean[:, None], 0.0)
-    spreads, _ = inverse_information(pairs.information.reshape(-1, size, size))
-    spreads = spreads.reshape(count, 2, 6, 6) + offsets[..., :, None] * offsets[..., None, :]
-    covariance = (weights[..., None, None] * spreads).sum(axis=1)
-    rotations = Rotation.from_rotvec(mean[:, 3:]).as_matrix() @ first
-    return rotations, mean[:, :3], covariance
 
 
 # Largest root mean square residual of a drogue's features: a share of a marker's radius, and at least these pixels.

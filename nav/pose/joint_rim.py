@@ -17,16 +17,10 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import RimOutline
 from geometry.se3 import Array, RigidTransform, exp_rotation, skew
 from geometry.stereo import EYES, StereoRig
-from nav.pose.joint import (
-    RELIABLE_SIGMAS,
-    TILT_PRIOR_RAD,
-    TiltPairs,
-    line_of_sight_rotations,
-    mixture_mean,
-    mode_weights,
-)
+from nav.pose.joint import RELIABLE_SIGMAS, TILT_PRIOR_RAD
 from nav.pose.marker_geometry import rotations_from_axes
 from nav.pose.pose_method import NoFixReason, Observation, PoseMode, RimEdges, Solution
+from nav.pose.tilt_pairs import TiltPairs, line_of_sight_rotations, mixture_mean, mode_weights
 
 # Standard deviation of an angle of which nothing is known. [rad]
 ROLL_SD_RAD = np.pi / np.sqrt(3)

@@ -11,9 +11,10 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import StereoRig
 from nav.pose.features import Features, stack_features
-from nav.pose.joint import adjust_both_tilts, solve_joint_batch, two_fold_starts
+from nav.pose.joint import adjust_both_tilts, solve_joint_batch
 from nav.pose.method_registry import pose_method
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, StatedTolerances
+from nav.pose.tilt_pairs import two_fold_starts
 from studies.acceptance.centroid_level.drawn_frames import Poses
 
 BATCHED = ("joint", "joint-hub")
