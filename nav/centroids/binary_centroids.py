@@ -253,6 +253,7 @@ def layout_with_room(layout: MarkerLayout, room_m: float) -> MarkerLayout:
     return replace(layout, radius_m=room_m)
 
 
+@lru_cache(maxsize=16)
 def smallest_gap_m(layout: MarkerLayout) -> float:
     """Smallest distance between two markers. [m]"""
     squares = ((layout.centers_m[:, None] - layout.centers_m) ** 2).sum(axis=2)

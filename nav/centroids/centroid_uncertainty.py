@@ -97,17 +97,17 @@ def sector_sums(x: Array32, y: Array32, residuals: Array32, weights: Array32, co
 @compiled
 def zone_sums(squares: Array32, present: Array32, inside: Array32, zones: Array32) -> Array:
     """(N, 1 + Z, 2) sums of squares, and counts, of all pixels and of those with shares inside within (Z, 2) zones."""
-    sums = np.zeros((len(squares), 1 + len(zones), 2))
+    sums = np.empty((len(squares), 1 + len(zones), 2))
     for n in range(len(squares)):
-        for k in range(squares.shape[1]):
-            if present[n, k] == _F(0):
-                continue
-            sums[n, 0, 0] += squares[n, k]
-            sums[n, 0, 1] += 1.0
-            for zone in range(len(zones)):
-                if zones[zone, 0] < inside[n, k] < zones[zone, 1]:
-                    sums[n, 1 + zone, 0] += squares[n, k]
-                    sums[n, 1 + zone, 1] += 1.0
+        # All pixels lie in the first zone. Without branches the compiler processes many pixels at once.
+        for zone in range(1 + len(zones)):
+            low, high = (-_F(np.inf), _F(np.inf)) if zone == 0 else (zones[zone - 1, 0], zones[zone - 1, 1])
+            total, count = 0.0, 0.0
+            for k in range(squares.shape[1]):
+                is_own = (present[n, k] > _F(0)) & (low < inside[n, k]) & (inside[n, k] < high)
+                count += _ONE if is_own else _F(0)
+                total += squares[n, k] if is_own else _F(0)
+            sums[n, zone, 0], sums[n, zone, 1] = total, count
     return sums
 
 

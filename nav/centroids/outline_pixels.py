@@ -17,7 +17,7 @@ from nav.numerics.compiled import Array32, compiled
 
 # Arrays of integers, or of an image's numbers.
 Cells = NDArray[Any]
-_ONE = np.float32(1)
+_ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @compiled
@@ -91,24 +91,44 @@ def choose_cells(
 
 
 @compiled
-def take_cells(picture: Cells, firsts: Cells, every: int, size: int, cells: Cells, filled: Array32) -> None:
-    """Fill (M, K) with a picture's values at the cells (M, at least K), -1 for none, of windows that begin at `firsts`.
+def place_cells(
+    cells: Cells, counts: Cells, starts: Array32, offsets: Array32, x: Array32, y: Array32, present: Array32
+) -> None:
+    """Fill (N, K) places of chosen cells from the outlines' centres, and 1; zeros behind the counts (N,).
+
+    Args:
+        cells, counts, starts, offsets: as in `choose_cells`.
+        x, y, present: filled.
+    """
+    size = len(offsets)
+    for n in range(len(x)):
+        for k in range(counts[n]):
+            x[n, k] = starts[n, 0] + offsets[cells[n, k] % size]
+            y[n, k] = starts[n, 1] + offsets[cells[n, k] // size]
+            present[n, k] = _ONE
+        x[n, counts[n] :], y[n, counts[n] :], present[n, counts[n] :] = _ZERO, _ZERO, _ZERO
+
+
+@compiled
+def take_cells(
+    picture: Cells, rows: Cells, firsts: Cells, every: int, size: int, cells: Cells, counts: Cells, taken: Array32
+) -> None:
+    """Fill some rows of (N, K) with a picture's values at the chosen cells of windows; zeros behind the counts (N,).
 
     Args:
         picture: of any kind of numbers.
-        firsts: (M, 2) column and row of each window's first cell on it.
+        rows: numbers of the rows.
+        firsts: (N, 2) column and row of each window's first cell on the picture.
         every: pixels between neighbouring cells.
         size: cells of a window's side.
-        cells: row S + column.
-        filled: zero where there is no cell.
+        cells, counts: as in `choose_cells`.
+        taken: filled.
     """
-    for n in range(len(filled)):
-        for k in range(filled.shape[1]):
-            cell = cells[n, k]
-            if cell < 0:
-                break
-            row, column = firsts[n, 1] + every * (cell // size), firsts[n, 0] + every * (cell % size)
-            filled[n, k] = picture[row, column]
+    for n in rows:
+        for k in range(counts[n]):
+            row, column = firsts[n, 1] + every * (cells[n, k] // size), firsts[n, 0] + every * (cells[n, k] % size)
+            taken[n, k] = picture[row, column]
+        taken[n, counts[n] :] = _ZERO
 
 
 # Discs up to this radius are used whole. Of larger discs the pixels within the band of the edge are used, and every
@@ -236,26 +256,24 @@ def _gather(
     cells = np.empty((len(outlines), size * size), np.int32)
     outline = _inverses_and_radii(outlines)
     counts, truncated = choose_cells(offsets, starts, outline, inside, limits, thin, frames, cells)
-    present = np.arange(max(1, int(counts.max()))) < counts[:, None]
-    cells = np.where(present, cells[:, : present.shape[1]], -1)
+    shape = len(outlines), max(1, int(counts.max()))
+    x, y, present = (np.empty(shape, np.float32) for _ in range(3))
+    place_cells(cells, counts, starts, offsets, x, y, present)
+    rows_of_eyes = [np.flatnonzero(outlines.eyes == eye) for eye in range(len(signals))]
 
     def taken(pictures: Sequence[_Picture]) -> Array32:
-        values = np.zeros(present.shape, np.float32)
-        for eye, picture in enumerate(pictures):
-            mine = np.flatnonzero(outlines.eyes == eye)
-            filled = np.zeros((len(mine), present.shape[1]), np.float32)
-            take_cells(picture, windows[mine], every, size, cells[mine], filled)
-            values[mine] = filled
+        values = np.empty(shape, np.float32)
+        for rows, picture in zip(rows_of_eyes, pictures, strict=True):
+            take_cells(picture, rows, windows, every, size, cells, counts, values)
         return values
 
     values = taken([signal.values for signal in signals])
     own = [signal.own for signal in signals if signal.own is not None]
-    column, row = cells % size, cells // size
     return OutlinePixels(
-        np.where(present, starts[:, :1] + offsets[column], np.float32(0)),
-        np.where(present, starts[:, 1:] + offsets[row], np.float32(0)),
+        x,
+        y,
         values,
-        present.astype(np.float32),
+        present,
         taken([signal.clipped for signal in signals]) > 0,
         outlines.centers_px,
         truncated,

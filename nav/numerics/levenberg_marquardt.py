@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from geometry.se3 import Array
+from nav.numerics.cholesky import damped_solutions, inverses
 from nav.numerics.compiled import Array32, compiled
 
 
@@ -113,45 +114,6 @@ def constrain_jacobian(jacobian: Array32, ties: Array32, tied: Array32) -> None:
             tied[n, count + p - followers] = jacobian[n, p]
 
 
-@compiled
-def solve_damped(matrix: Array, scale: Array, gradient: Array, damping: float, root: Array, step: Array) -> None:
-    """Fill the solution (P,) of a system with a matrix (P, P) and a right side (P,), by Cholesky decomposition.
-
-    Rows and columns are scaled by (P,), and then the damping is added to the diagonal. A matrix that is not positive
-    definite gives NaN. `root` (P, P) is overwritten.
-    """
-    size = len(gradient)
-    for i in range(size):
-        for j in range(i + 1):
-            rest = matrix[i, j] * scale[i] * scale[j] + (damping if i == j else 0.0)
-            for m in range(j):
-                rest -= root[i, m] * root[j, m]
-            root[i, j] = np.sqrt(rest) if i == j else rest / root[j, j]
-    for i in range(size):
-        rest = gradient[i] * scale[i]
-        for m in range(i):
-            rest -= root[i, m] * step[m]
-        step[i] = rest / root[i, i]
-    for back in range(size):
-        i = size - 1 - back
-        rest = step[i]
-        for m in range(i + 1, size):
-            rest -= root[m, i] * step[m]
-        step[i] = rest / root[i, i]
-    for i in range(size):
-        step[i] *= scale[i]
-
-
-@compiled
-def damped_steps(matrices: Array, scales: Array, gradients: Array, dampings: Array) -> Array:
-    """Solutions (N, P) of systems with matrices (N, P, P), scales and right sides (N, P) and dampings (N,)."""
-    count, size = gradients.shape
-    steps, root = np.empty((count, size)), np.empty((size, size))
-    for n in range(count):
-        solve_damped(matrices[n], scales[n], gradients[n], dampings[n], root, steps[n])
-    return steps
-
-
 # Values (N, K) and their derivatives (N, P, K) at (N, P) parameters.
 Model = Callable[[Array], tuple[Array32, Array32]]
 
@@ -197,14 +159,12 @@ class NormalEquations:
     @cached_property
     def inverse(self) -> Array:
         """(N, P, P) inverse matrices, kept invertible by a ridge on the matrices scaled to a unit diagonal."""
-        scales = self._scales[:, :, None] * self._scales[:, None, :]
-        inverse: Array = np.linalg.inv(self._products[0] * scales + _RIDGE * np.eye(scales.shape[1])) * scales
-        return inverse
+        return inverses(self._products[0], self._scales, _RIDGE)
 
     def step(self, damping: Array) -> Array:
         """(N, P) steps with (N,) dampings."""
         normal, gradient = self._products
-        return damped_steps(normal, self._scales, gradient, damping + _RIDGE)
+        return damped_solutions(normal, self._scales, gradient, damping + _RIDGE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,13 +237,11 @@ def minimise(
             new_residuals = data - values
             new_cost = _costs(new_residuals, weights)
         better = new_cost <= cost * (1 + _ROUNDING)
-        if better.all():
-            parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian
-        else:
-            parameters = np.where(better[:, None], tried, parameters)
-            cost = np.where(better, new_cost, cost)
-            residuals = np.where(better[:, None], new_residuals, residuals)
-            jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        worse = np.flatnonzero(~better)
+        if len(worse):
+            for new, old in (tried, parameters), (new_cost, cost), (new_residuals, residuals), (new_jacobian, jacobian):
+                new[worse] = old[worse]
+        parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian
         damping = np.where(better, np.maximum(damping / 10, _SMALLEST_DAMPING), damping * 10)
         converged = np.abs(step[:, :2]).max(axis=1) < small_step_px
         normal = NormalEquations(jacobian, residuals, weights)

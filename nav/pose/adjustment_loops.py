@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
+from nav.numerics.cholesky import factorise, invert, solve
 from nav.numerics.compiled import compiled
-from nav.numerics.levenberg_marquardt import solve_damped
 
 _ITERATIONS = 20
 # Keeps the normal equations of a frontal, far drogue solvable; far below the information of any marker.
@@ -21,7 +21,7 @@ _LARGEST_MOVE_FRACTION = 0.3
 _LARGEST_DEPARTURE_SIGMAS = 10.0
 # A step that would lower the cost by less moves no parameter by more than 5e-5 deviations; it is taken as the last one.
 _CONVERGED = 1e-9
-# Pivots of a scaled information that are smaller may be rounding; the least of a drogue at 40 m is far larger.
+# Smaller pivots of a scaled information may be rounding; a whole ring's are above 0.04 from 2 to 200 m.
 _LEAST_PIVOT = 1e-13
 # A start whose steps had to be shortened to this share is at its minimum within rounding.
 _LEAST_REACH = 1e-4
@@ -310,7 +310,8 @@ def _find_step(
         gradient[k] = 0.0
         for m in range(len(residuals)):
             gradient[k] -= jacobian[k, m] * residuals[m]
-    solve_damped(normal, scale, gradient, _DAMPING_FRACTION, root, step)
+    factorise(normal, scale, _DAMPING_FRACTION, root)
+    solve(root, scale, gradient, step)
     gain = 0.0
     for k in range(len(step)):
         gain += step[k] * gradient[k] / 2
@@ -407,43 +408,14 @@ def adjust_frames(
 def invert_information(information: Array, covariances: Array, determined: NDArray[np.bool_]) -> None:
     """Fill covariances (S, 6, 6) of poses and (S,) whether their information (S, K, K) determines them; else zero."""
     count, size, _ = information.shape
-    scale, lower, inverse = np.empty(size), np.empty((size, size)), np.zeros((size, size))
+    scale, lower, root = np.empty(size), np.empty((size, size)), np.empty((size, size))
     for s in range(count):
-        covariances[s] = 0.0
-        determined[s] = _fill_inverse_root(information[s], scale, lower, inverse)
-        if not determined[s]:
-            continue
-        for i in range(6):
-            for j in range(i + 1):
-                total = 0.0
-                for k in range(i, size):
-                    total += inverse[k, i] * inverse[k, j]
-                covariances[s, i, j] = covariances[s, j, i] = total * scale[i] * scale[j]
-
-
-@compiled
-def _fill_inverse_root(matrix: Array, scale: Array, lower: Array, inverse: Array) -> bool:
-    """Fill the inverse of the lower Cholesky factor of a matrix, scaled by (K,) to a unit diagonal; whether it has one.
-
-    Metres and radians differ in size: only scaled pivots can be compared with rounding. `lower` is overwritten.
-    """
-    size = len(matrix)
-    for i in range(size):
-        if not (matrix[i, i] > 0 and np.isfinite(matrix[i, i])):
-            return False
-        scale[i] = 1 / np.sqrt(matrix[i, i])
-    for i in range(size):
-        for j in range(i + 1):
-            rest = matrix[i, j] * scale[i] * scale[j]
-            for m in range(j):
-                rest -= lower[i, m] * lower[j, m]
-            if i == j and not rest > _LEAST_PIVOT:
-                return False
-            lower[i, j] = np.sqrt(rest) if i == j else rest / lower[j, j]
-    for j in range(size):
-        for i in range(j, size):
-            rest = 1.0 if i == j else 0.0
-            for m in range(j, i):
-                rest -= lower[i, m] * inverse[m, j]
-            inverse[i, j] = rest / lower[i, i]
-    return True
+        # Metres and radians differ in size: only scaled pivots can be compared with rounding.
+        for k in range(size):
+            scale[k] = 1 / np.sqrt(information[s, k, k])
+        least = factorise(information[s], scale, 0.0, lower)
+        determined[s] = np.isfinite(least) and least > _LEAST_PIVOT
+        if determined[s]:
+            invert(lower, scale, root, covariances[s])
+        else:
+            covariances[s] = 0.0

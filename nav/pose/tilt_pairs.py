@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from geometry.se3 import Array
+from nav.numerics.cholesky import factorise
 from nav.numerics.compiled import compiled
 from nav.pose.adjustment import AdjustedPoses, contiguous, inverse_information
 from nav.pose.features import Features
@@ -235,14 +236,18 @@ def mode_weights(pairs: TiltPairs, prior_rad: float) -> Array:
 def _fill_weights(
     rotations: Array, translations_m: Array, costs: Array, information: Array, prior_rad: float, weights: Array
 ) -> None:
-    lower = np.empty(information.shape[2:])
+    lower, ones = np.empty(information.shape[2:]), np.ones(information.shape[2])
     for b in range(len(weights)):
         turned2 = 0.0
         for k in range(3):
             turned2 += (rotations[b, 0, k, 2] - rotations[b, 1, k, 2]) ** 2
         for side in range(2):
             axis_x, axis_y = rotations[b, side, 0, 2], rotations[b, side, 1, 2]
-            log_weight = -costs[b, side] - _log_determinant(information[b, side], lower) / 2
+            # The root of the determinant is the product of the factor's diagonal; NaN for a matrix that has none.
+            factorise(information[b, side], ones, 0.0, lower)
+            log_weight = -costs[b, side]
+            for k in range(len(lower)):
+                log_weight -= np.log(lower[k, k])
             log_weight -= (axis_x * axis_x + axis_y * axis_y) / (2 * prior_rad * prior_rad)
             is_ahead = rotations[b, side, 2, 2] > 0 and translations_m[b, side, 2] > 0
             is_other = side == 0 or turned2 > _SAME_TURN_RAD**2
@@ -252,20 +257,6 @@ def _fill_weights(
         most = max(weights[b, 0], weights[b, 1])
         first, second = np.exp(weights[b, 0] - most), np.exp(weights[b, 1] - most)
         weights[b, 0], weights[b, 1] = first / (first + second), second / (first + second)
-
-
-@compiled
-def _log_determinant(matrix: Array, lower: Array) -> float:
-    """Logarithm of the determinant of a positive definite matrix; NaN for others. `lower` is overwritten."""
-    total = 0.0
-    for i in range(len(matrix)):
-        for j in range(i + 1):
-            rest = matrix[i, j]
-            for m in range(j):
-                rest -= lower[i, m] * lower[j, m]
-            lower[i, j] = np.sqrt(rest) if i == j else rest / lower[j, j]
-        total += 2 * np.log(lower[i, i])
-    return total
 
 
 def mixture_mean(pairs: TiltPairs, weights: Array) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ import pytest
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.matching import ring_matching
 from nav.numerics import levenberg_marquardt
-from nav.pose import adjustment_loops
+from nav.pose import adjustment_loops, tilt_pairs
 from nav.tracking import pose_predict
 
 
@@ -24,14 +24,14 @@ from nav.numerics import levenberg_marquardt
 from nav.tracking import pose_predict
 from nav.realtime import warm_up_jit
 from nav.pair_navigator import PairNavigator
-from nav.pose import adjustment_loops
+from nav.pose import adjustment_loops, tilt_pairs
 from render.engine import load_engine
 from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
     loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels, pose_predict,
-             ring_matching)
+             ring_matching, tilt_pairs)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -63,6 +63,7 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
         outline_pixels,
         pose_predict,
         ring_matching,
+        tilt_pairs,
     ],
 )
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops: Any) -> None:

@@ -35,17 +35,3 @@ def test_sums_of_least_squares_are_those_of_numpy() -> None:
     np.testing.assert_allclose(filled, weights * np.einsum("npk,npq,nqk->nk", exact, covariance, exact), rtol=1e-4)
     # A fit swallows as many pixels' worth of noise as it has parameters.
     np.testing.assert_allclose(filled.sum(axis=1), 7, rtol=1e-4)
-
-
-def test_damped_steps_solve_their_systems() -> None:
-    rng = np.random.default_rng(2)
-    arms = rng.normal(size=(6, 9, 9))
-    matrices, gradients, dampings = arms @ arms.transpose(0, 2, 1) + np.eye(9), rng.normal(size=(6, 9)), rng.random(6)
-    scales = rng.uniform(0.1, 3, (6, 9))
-    steps = levenberg_marquardt.damped_steps(matrices, scales, gradients, dampings)
-    # What is added to a scaled diagonal is the more in the matrix's own units, the smaller the scale is.
-    damped = matrices + (dampings[:, None] / scales**2)[:, None] * np.eye(9)
-    np.testing.assert_allclose(steps, np.linalg.solve(damped, gradients[..., None])[..., 0], rtol=1e-9)
-    matrices[0] *= -1
-    steps = levenberg_marquardt.damped_steps(matrices, scales, gradients, 0 * dampings)
-    assert np.isnan(steps).any(axis=1).tolist() == [True] + 5 * [False]
