@@ -47,9 +47,10 @@ class PinholeCamera:
             (..., 2) pixel coordinates. [px]
         """
         p = np.asarray(points_m, dtype=np.float64)
-        return np.stack(
-            [self.fx_px * p[..., 0] / p[..., 2] + self.cx_px, self.fy_px * p[..., 1] / p[..., 2] + self.cy_px], axis=-1
-        )
+        pixels = np.empty((*p.shape[:-1], 2))
+        pixels[..., 0] = self.fx_px * p[..., 0] / p[..., 2] + self.cx_px
+        pixels[..., 1] = self.fy_px * p[..., 1] / p[..., 2] + self.cy_px
+        return pixels
 
     def rays(self, pixels_px: ArrayLike) -> Array:
         """(..., 3) directions through (..., 2) pixel coordinates, scaled to z = 1."""

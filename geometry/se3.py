@@ -205,9 +205,15 @@ def exp_rotation(vector_rad: Array) -> Array:
 
 def log_rotation(rotation: Array) -> Array:
     """(3,) rotation vector of a (3, 3) rotation, which is not checked; at most pi long. [rad]"""
-    # To check the matrix would take three times as long as the rest.
-    vector: Array = Rotation.from_matrix(rotation, assume_valid=True).as_rotvec()
-    return vector
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    x, y, z, cosine = (zy - yz) / 2, (xz - zx) / 2, (yx - xy) / 2, (xx + yy + zz - 1) / 2
+    if cosine < 0:
+        # Towards half a turn the sine vanishes, and with it what the closed form takes the axis from.
+        vector: Array = Rotation.from_matrix(rotation, assume_valid=True).as_rotvec()
+        return vector
+    sine = math.hypot(x, y, z)
+    stretch = math.atan2(sine, cosine) / sine if sine > 0 else 1.0
+    return np.array([stretch * x, stretch * y, stretch * z])
 
 
 def left_jacobian(vector_rad: Array) -> Array:

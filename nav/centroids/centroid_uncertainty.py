@@ -105,8 +105,8 @@ def zone_sums(squares: Array32, present: Array32, inside: Array32, zones: Array3
             total, count = 0.0, 0.0
             for k in range(squares.shape[1]):
                 is_own = (present[n, k] > _F(0)) & (low < inside[n, k]) & (inside[n, k] < high)
-                count += _ONE if is_own else _F(0)
-                total += squares[n, k] if is_own else _F(0)
+                count += 1.0 if is_own else 0.0
+                total += float(squares[n, k]) if is_own else 0.0
             sums[n, zone, 0], sums[n, zone, 1] = total, count
     return sums
 

@@ -49,7 +49,7 @@ class Ellipses:
 
 def are_positive(shapes_px: Array) -> NDArray[np.bool_]:
     """(M,) whether symmetric matrices (M, 2, 2) have two semi-axes above zero."""
-    positive: NDArray[np.bool_] = (_determinants(shapes_px) > 0) & (np.trace(shapes_px, axis1=1, axis2=2) > 0)
+    positive: NDArray[np.bool_] = (_determinants(shapes_px) > 0) & (shapes_px[:, 0, 0] + shapes_px[:, 1, 1] > 0)
     return positive
 
 
@@ -102,6 +102,9 @@ def _determinants(matrices: Array) -> Array:
 
 
 def _square_roots(squares: Array) -> Array:
-    values, vectors = np.linalg.eigh(squares)
-    roots: Array = np.einsum("mik,mk,mjk->mij", vectors, np.sqrt(np.maximum(values, 0)), vectors)
+    """Square roots of (M, 2, 2) symmetric matrices without negative eigenvalues, in closed form."""
+    root_of_determinant = np.sqrt(np.maximum(_determinants(squares), 0))[:, None, None]
+    trace = (squares[:, 0, 0] + squares[:, 1, 1])[:, None, None]
+    scale = np.sqrt(np.maximum(trace + 2 * root_of_determinant, np.finfo(np.float64).tiny))
+    roots: Array = (squares + root_of_determinant * np.eye(2)) / scale
     return roots

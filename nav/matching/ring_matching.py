@@ -8,6 +8,7 @@ map has one more column, for the depth.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -324,14 +325,26 @@ def _nearest_blobs(
 ) -> NDArray[np.int64]:
     """(N,) the blob nearest to each marker's image, -1 where no blob of similar size lies within the tolerance."""
     places_px = _places_px(layout, affine, np.zeros(2) if lean_px_per_m is None else lean_px_per_m)
-    radius_px = layout.radius_m * np.sqrt(abs(_determinant(affine)))
-    gaps = places_px[:, None] - blobs.centers_px
-    distance = np.sqrt(gaps[..., 0] ** 2 + gaps[..., 1] ** 2)
-    alike = (blobs.radii_px < _SIZE_FACTOR * radius_px) & (radius_px < _SIZE_FACTOR * blobs.radii_px)
-    distance[:, ~alike] = np.inf
-    nearest = distance.argmin(axis=1)
-    hit = distance[np.arange(layout.count), nearest] < tolerance * radius_px
-    return np.where(hit, nearest, -1)
+    radius_px = layout.radius_m * math.sqrt(abs(_determinant(affine)))
+    return _nearest_alike(places_px, radius_px, tolerance * radius_px, blobs.centers_px, blobs.radii_px)
+
+
+@compiled
+def _nearest_alike(
+    places_px: Array, radius_px: float, tolerance_px: float, centers_px: Array, radii_px: Array
+) -> NDArray[np.int64]:
+    """(N,) the nearest of M blobs of similar size to each place, -1 where none lies within the tolerance."""
+    nearest = np.full(len(places_px), -1)
+    for place in range(len(places_px)):
+        least_px = tolerance_px
+        for blob in range(len(centers_px)):
+            size_px = radii_px[blob]
+            if size_px < _SIZE_FACTOR * radius_px and radius_px < _SIZE_FACTOR * size_px:
+                x_px, y_px = places_px[place, 0] - centers_px[blob, 0], places_px[place, 1] - centers_px[blob, 1]
+                gap_px = np.sqrt(x_px * x_px + y_px * y_px)
+                if gap_px < least_px:
+                    least_px, nearest[place] = gap_px, blob
+    return nearest
 
 
 def _determinant(affine: Array) -> float:
@@ -341,5 +354,5 @@ def _determinant(affine: Array) -> float:
 def _singular_values(affine: Array) -> tuple[float, float]:
     """Largest and smallest singular value of a map's linear part, in closed form."""
     (a, b), (c, d) = affine[:, :2].tolist()
-    even, odd = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
-    return float(even + odd), float(abs(even - odd))
+    even, odd = math.hypot(a + d, b - c) / 2, math.hypot(a - d, b + c) / 2
+    return even + odd, abs(even - odd)

@@ -1,4 +1,4 @@
-"""Cholesky's decomposition of small matrices, in compiled loops: for these, the calls of LAPACK take most of the time."""
+"""Cholesky's decomposition of small matrices, for which calls of LAPACK take longer than the work, compiled."""
 
 from __future__ import annotations
 

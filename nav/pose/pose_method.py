@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,23 +121,22 @@ class Observation:
         if self.layout.hub_center_m is None and self.hub_seen.any():
             raise ValueError("hub_px: the drogue has no hub, got a measured one")
 
-    @property
+    @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """(2, N) which markers were measured."""
-        seen: NDArray[np.bool_] = ~np.isnan(self.pixels_px).any(axis=2)
-        return seen
+        return _measured(self.pixels_px)
 
-    @property
+    @cached_property
     def hub_seen(self) -> NDArray[np.bool_]:
         """(2, 2) which edges of the hub were measured, by eye and edge."""
         assert self.hub_px is not None
-        seen: NDArray[np.bool_] = ~np.isnan(self.hub_px).any(axis=2)
-        return seen
+        return _measured(self.hub_px)
 
-    @property
+    @cached_property
     def paired(self) -> NDArray[np.bool_]:
         """(N,) which markers both eyes measured."""
-        paired: NDArray[np.bool_] = self.seen.all(axis=0)
+        paired: NDArray[np.bool_] = self.seen[0] & self.seen[1]
+        paired.flags.writeable = False
         return paired
 
     @property
@@ -145,6 +144,13 @@ class Observation:
         """Root mean square of the standard deviations per axis of the measured centres. [px]"""
         variances = np.diagonal(self.cov_px2[self.seen], axis1=1, axis2=2)
         return float(np.sqrt(variances.mean()))
+
+
+def _measured(pixels_px: Array) -> NDArray[np.bool_]:
+    """(E, F) which places (E, F, 2) are numbers."""
+    measured: NDArray[np.bool_] = ~np.isnan(pixels_px).any(axis=2)
+    measured.flags.writeable = False
+    return measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,27 +211,25 @@ _RIG_MISMATCH_FRACTION, _RIG_MISMATCH_PX = 0.35, 1.0
 
 def stereo_fault(observation: Observation) -> NoFixReason | None:
     """Why no pose can be computed from the markers in both eyes; None when one can."""
-    for eye in range(2):
-        reason = _invalid_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
-        if reason is not None:
-            return reason
-    return _too_few_pairs(observation) or _degenerate_pairs(observation) or _rig_mismatch(observation)
+    return (
+        _invalid_numbers(observation, observation.pixels_px, observation.cov_px2, "marker")
+        or _too_few_pairs(observation)
+        or _degenerate_pairs(observation)
+        or _rig_mismatch(observation)
+    )
 
 
 def hub_fault(observation: Observation) -> NoFixReason | None:
     """Why the measured edges of the hub are invalid; None when they are valid."""
     assert observation.hub_px is not None
     assert observation.hub_cov_px2 is not None
-    for eye in range(2):
-        reason = _invalid_numbers(observation, observation.hub_px[eye], observation.hub_cov_px2[eye], eye, "hub edge")
-        if reason is not None:
-            return reason
-    return None
+    return _invalid_numbers(observation, observation.hub_px, observation.hub_cov_px2, "hub edge")
 
 
 def eye_fault(observation: Observation, eye: int, least: int) -> NoFixReason | None:
     """Why no pose can be computed from the markers of one eye, 0 left or 1 right; None when one can."""
-    reason = _invalid_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
+    pixels, cov = observation.pixels_px[eye : eye + 1], observation.cov_px2[eye : eye + 1]
+    reason = _invalid_numbers(observation, pixels, cov, "marker", eye)
     if reason is not None:
         return reason
     seen = observation.seen[eye]
@@ -236,20 +240,27 @@ def eye_fault(observation: Observation, eye: int, least: int) -> NoFixReason | N
     return None
 
 
-def _invalid_numbers(observation: Observation, pixels: Array, cov: Array, eye: int, what: str) -> NoFixReason | None:
+def _invalid_numbers(
+    observation: Observation, pixels: Array, cov: Array, what: str, first_eye: int = 0
+) -> NoFixReason | None:
+    """Why places (E, F, 2) of E eyes, or their covariances (E, F, 2, 2), cannot be right; None when they can."""
     size = np.array([observation.rig.camera.width_px, observation.rig.camera.height_px])
-    seen = ~np.isnan(pixels).any(axis=1)
-    outside = seen & ((pixels < -_OUTSIDE_IMAGES * size) | (pixels > (1 + _OUTSIDE_IMAGES) * size)).any(axis=1)
+    seen = _measured(pixels)
+    outside = seen & ((pixels < -_OUTSIDE_IMAGES * size) | (pixels > (1 + _OUTSIDE_IMAGES) * size)).any(axis=2)
     if outside.any():
-        index = int(np.argmax(outside))
-        x, y = pixels[index]
-        return NoFixReason(f"{what} {index} of the {EYES[eye]} eye lies far outside the image, at ({x:g}, {y:g}) px")
-    # Products of huge or infinite entries are nan, which fails the comparisons below.
+        eye, index = np.argwhere(outside)[0].tolist()
+        x, y = pixels[eye, index]
+        where = f"{what} {index} of the {EYES[first_eye + eye]} eye"
+        return NoFixReason(f"{where} lies far outside the image, at ({x:g}, {y:g}) px")
+    # Products of huge or infinite entries are nan, which fails the comparisons below; a finite sum has finite terms.
     with np.errstate(invalid="ignore", over="ignore"):
-        determinant = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] * cov[:, 1, 0]
-        sound = np.isfinite(cov).all(axis=(1, 2)) & (cov[:, 0, 0] > 0) & (determinant > 0) & np.isfinite(determinant)
-    if (seen & ~sound).any():
-        return NoFixReason(f"{what} {int(np.argmax(seen & ~sound))} of the {EYES[eye]} eye has no positive covariance")
+        a, b, c, d = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
+        determinant = a * d - b * c
+        sound = (a > 0) & (determinant > 0) & np.isfinite(determinant + a + b + c + d)
+    unsound = seen & ~sound
+    if unsound.any():
+        eye, index = np.argwhere(unsound)[0].tolist()
+        return NoFixReason(f"{what} {index} of the {EYES[first_eye + eye]} eye has no positive covariance")
     return None
 
 

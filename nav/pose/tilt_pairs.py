@@ -19,7 +19,7 @@ _SAME_TURN_RAD = 1e-4
 # Keeps the affine fit of collinear markers solvable; negligible for all others.
 _RIDGE_FRACTION = 1e-12
 # Coincident markers have no scale; any value works, since the cost of the adjustment is high anyway.
-_TINY = np.finfo(np.float64).tiny
+_TINY = float(np.finfo(np.float64).tiny)
 _LEAST_SCALE = _TINY**0.5
 
 
@@ -227,8 +227,8 @@ def mode_weights(pairs: TiltPairs, prior_rad: float) -> Array:
     poses keeps the first, which is not sound.
     """
     weights = np.empty(pairs.costs.shape)
-    values = (pairs.rotations, pairs.translations_m, pairs.costs, pairs.information)
-    _fill_weights(*map(contiguous, values), float(prior_rad), weights)
+    poses = contiguous(pairs.rotations), contiguous(pairs.translations_m)
+    _fill_weights(*poses, contiguous(pairs.costs), contiguous(pairs.information), float(prior_rad), weights)
     return weights
 
 
