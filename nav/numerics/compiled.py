@@ -19,12 +19,12 @@ _Loop = TypeVar("_Loop", bound=Callable[..., Any])
 
 # The compiler may take sums in any order and turn divisions into products, so that a processor works on many pixels at
 # once. Infinities and NaN keep their meaning: a step that diverges must be seen.
-_FASTMATH = {"reassoc", "nsz", "contract", "arcp"}
+FASTMATH = {"reassoc", "nsz", "contract", "arcp"}
 # A caller's machine code holds all that it calls, inlined. Numba would keep a copy of a large function in each of its
 # callers, each with its own order of sums, and the linker would take the first in the process for all: results would
 # depend on what else the process had compiled or loaded. Nothing calls the loops from C.
 _OPTIONS = {
-    "fastmath": _FASTMATH,
+    "fastmath": FASTMATH,
     "forceinline": True,
     "no_cfunc_wrapper": True,
     "error_model": "numpy",
@@ -35,6 +35,15 @@ _OPTIONS = {
 def compiled(loop: _Loop) -> _Loop:
     """Compile a function over arrays at its first call, and keep the result on disk; see `kept_on_disk`."""
     return kept_on_disk(loop, _OPTIONS)
+
+
+@compiled
+def is_finite(number: float) -> bool:
+    """Whether a number is neither infinite nor NaN.
+
+    numba's `isfinite` subtracts the number from itself, which cancels where sums may be reordered: NaN would pass.
+    """
+    return abs(number) < np.inf
 
 
 @intrinsic  # type: ignore[untyped-decorator]

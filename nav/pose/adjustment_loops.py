@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from nav.numerics.cholesky import factorise, invert, solve
-from nav.numerics.compiled import compiled
+from nav.numerics.compiled import compiled, is_finite
 
 _ITERATIONS = 20
 # Keeps the normal equations of a frontal, far drogue solvable; far below the information of any marker.
@@ -189,7 +189,7 @@ def _add_priors(
 ) -> float:
     """Fill the residuals of the priors on tilt (where it has one) and departures; returns half their sum of squares."""
     at = column
-    if np.isfinite(shared.tilt_prior_rad):
+    if is_finite(shared.tilt_prior_rad):
         x, y, z = (
             rotation[0, 2] / shared.tilt_prior_rad,
             rotation[1, 2] / shared.tilt_prior_rad,
@@ -254,7 +254,7 @@ def linearise_frame(
                 (e * count + f, (eyes + e) * count + f), shared.huber_sigmas, jacobian, residuals
             )
     cost += _add_priors(shared, rotation, departures, 2 * eyes * count, jacobian, residuals)
-    return cost if in_front and np.isfinite(cost) else np.inf
+    return cost if in_front and is_finite(cost) else np.inf
 
 
 @compiled
@@ -361,7 +361,7 @@ def adjust_frames(
     """
     count, free = departures.shape
     size = 6 + free
-    prior_rows = 2 if np.isfinite(shared.tilt_prior_rad) else 0
+    prior_rows = 2 if is_finite(shared.tilt_prior_rad) else 0
     rows = 2 * measured.shape[2] * measured.shape[3] + prior_rows + free
     jacobian, residuals = np.empty((2, size, rows)), np.empty((2, rows))
     turned, moved, departed = np.empty((3, 3)), np.empty(3), np.empty(free)
@@ -374,7 +374,7 @@ def adjust_frames(
             shared, own, coupled, rotations[s], translations_m[s], departures[s], jacobian[0], residuals[0]
         )
         for _ in range(_ITERATIONS):
-            if not np.isfinite(cost):
+            if not is_finite(cost):
                 break
             _fill_normal_matrix(jacobian[now], normal)
             gain = _find_step(jacobian[now], residuals[now], normal, scale, gradient, root, step)
@@ -414,7 +414,7 @@ def invert_information(information: Array, covariances: Array, determined: NDArr
         for k in range(size):
             scale[k] = 1 / np.sqrt(information[s, k, k])
         least = factorise(information[s], scale, 0.0, lower)
-        determined[s] = np.isfinite(least) and least > _LEAST_PIVOT
+        determined[s] = is_finite(least) and least > _LEAST_PIVOT
         if determined[s]:
             invert(lower, scale, root, covariances[s])
         else:

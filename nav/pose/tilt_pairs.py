@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.se3 import Array
 from nav.numerics.cholesky import factorise
-from nav.numerics.compiled import compiled
+from nav.numerics.compiled import compiled, is_finite
 from nav.pose.adjustment import AdjustedPoses, contiguous, inverse_information
 from nav.pose.features import Features
 
@@ -251,8 +251,8 @@ def _fill_weights(
             log_weight -= (axis_x * axis_x + axis_y * axis_y) / (2 * prior_rad * prior_rad)
             is_ahead = rotations[b, side, 2, 2] > 0 and translations_m[b, side, 2] > 0
             is_other = side == 0 or turned2 > _SAME_TURN_RAD**2
-            weights[b, side] = log_weight if is_ahead and is_other and np.isfinite(log_weight) else -np.inf
-        if not np.isfinite(weights[b, 0]) and not np.isfinite(weights[b, 1]):
+            weights[b, side] = log_weight if is_ahead and is_other and is_finite(log_weight) else -np.inf
+        if not is_finite(weights[b, 0]) and not is_finite(weights[b, 1]):
             weights[b, 0] = 0.0
         most = max(weights[b, 0], weights[b, 1])
         first, second = np.exp(weights[b, 0] - most), np.exp(weights[b, 1] - most)

@@ -17,6 +17,7 @@ import pytest
 
 from geometry import compiled_loops
 from geometry.compiled_loops import kept_on_disk
+from nav.numerics.compiled import FASTMATH, is_finite
 
 CALLEE = """
 from geometry.compiled_loops import compiled
@@ -190,3 +191,13 @@ def test_machine_code_of_a_loop_holds_all_the_arithmetic_that_the_loop_calls(tmp
     apart = {loop: parts for loop, *parts in map(str.split, done.stdout.splitlines())}
     assert {"adjust_frames", "leverages", "draw_discs"} <= apart.keys()
     assert {loop: parts for loop, parts in apart.items() if parts} == {}
+
+
+def test_numbers_are_told_from_infinities_and_nan_after_sums() -> None:
+    # What numba's own test of a sum that it may reorder does not tell.
+    summed: Any = numba.njit(
+        lambda first, second, third: is_finite(first - np.log(second) - first / 2 - third), fastmath=FASTMATH
+    )
+    assert summed(1.0, 2.0, 3.0)
+    for numbers in ((1.0, np.nan, 3.0), (np.inf, 2.0, 3.0), (1.0, 0.0, 3.0), (1.0, 2.0, np.nan)):
+        assert not summed(*numbers)
