@@ -99,12 +99,13 @@ def zone_sums(squares: Array32, present: Array32, inside: Array32, zones: Array3
     """(N, 1 + Z, 2) sums of squares, and counts, of all pixels and of those with shares inside within (Z, 2) zones."""
     sums = np.empty((len(squares), 1 + len(zones), 2))
     for n in range(len(squares)):
-        # All pixels lie in the first zone. Without branches the compiler processes many pixels at once.
+        # The first sums are of all pixels. Without branches the compiler processes many pixels at once.
         for zone in range(1 + len(zones)):
-            low, high = (-_F(np.inf), _F(np.inf)) if zone == 0 else (zones[zone - 1, 0], zones[zone - 1, 1])
+            everywhere = zone == 0
+            low, high = zones[zone - 1, 0], zones[zone - 1, 1]
             total, count = 0.0, 0.0
             for k in range(squares.shape[1]):
-                is_own = (present[n, k] > _F(0)) & (low < inside[n, k]) & (inside[n, k] < high)
+                is_own = (present[n, k] > _F(0)) & (everywhere | ((low < inside[n, k]) & (inside[n, k] < high)))
                 count += 1.0 if is_own else 0.0
                 total += float(squares[n, k]) if is_own else 0.0
             sums[n, zone, 0], sums[n, zone, 1] = total, count

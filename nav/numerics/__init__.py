@@ -1,1 +1,1 @@
-"""Compiled loops, least squares, medians and threads that centroids, poses and tracking share."""
+"""Compiled loops, least squares, small matrices, medians and threads that centroids, poses and tracking share."""

@@ -16,10 +16,10 @@ def factorise(matrix: Array, scale: Array, damping: float, lower: Array) -> floa
         matrix: symmetric; only its lower triangle is read.
         scale: mostly what brings the diagonal to one, so that pivots can be compared with rounding.
         damping: added to the scaled diagonal.
-        lower: filled up to its diagonal; NaN from the first pivot on that is negative.
+        lower: filled up to its diagonal; no numbers from the first pivot on that is not above zero.
 
     Returns:
-        The least pivot; NaN or negative for a matrix that is not positive definite.
+        The least pivot; zero, negative or NaN for a matrix that is not positive definite.
     """
     least = np.inf
     for i in range(len(matrix)):
@@ -75,7 +75,7 @@ def invert(lower: Array, scale: Array, root: Array, inverse: Array) -> None:
 
 @compiled
 def inverses(matrices: Array, scales: Array, damping: float) -> Array:
-    """(N, P, P) inverses of matrices with scales (N, P); NaN for those that are not positive definite."""
+    """(N, P, P) inverses of matrices with scales (N, P); not finite for those that are not positive definite."""
     inverted, size = np.empty_like(matrices), matrices.shape[1]
     lower, root = np.empty((size, size)), np.empty((size, size))
     for n in range(len(matrices)):

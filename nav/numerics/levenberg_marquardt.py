@@ -114,7 +114,7 @@ def constrain_jacobian(jacobian: Array32, ties: Array32, tied: Array32) -> None:
             tied[n, count + p - followers] = jacobian[n, p]
 
 
-# Values (N, K) and their derivatives (N, P, K) at (N, P) parameters.
+# Values (N, K) and their derivatives (N, P, K) at (N, P) parameters, in new arrays, which the caller may change.
 Model = Callable[[Array], tuple[Array32, Array32]]
 
 _FIRST_DAMPING = 1e-4

@@ -21,7 +21,7 @@ _LARGEST_MOVE_FRACTION = 0.3
 _LARGEST_DEPARTURE_SIGMAS = 10.0
 # A step that would lower the cost by less moves no parameter by more than 5e-5 deviations; it is taken as the last one.
 _CONVERGED = 1e-9
-# Smaller pivots of a scaled information may be rounding; a whole ring's are above 0.04 from 2 to 200 m.
+# Smaller pivots of a scaled information may be rounding; a whole ring's are above 1e-5 up to 200 m, 20 degrees aside.
 _LEAST_PIVOT = 1e-13
 # A start whose steps had to be shortened to this share is at its minimum within rounding.
 _LEAST_REACH = 1e-4

@@ -57,7 +57,7 @@ class JointBatch:
         translations_m: (B, 3).
         covariances: (B, 6, 6) in the tangent of `datasets_manifest.types.estimates`.
         sound: (B,) whether the measurements determine a pose in front of the cameras; the other values of a frame are
-            meaningless where they do not.
+            meaningless, often NaN, where they do not.
         tilt_sign_reliable: (B,) whether the tilt is large enough for its sign to be certain.
         mode_rotations: (B, 2, 3, 3) the poses from both starts, the best first.
         mode_translations_m: (B, 2, 3).

@@ -18,9 +18,8 @@ from nav.pose.features import Features
 _SAME_TURN_RAD = 1e-4
 # Keeps the affine fit of collinear markers solvable; negligible for all others.
 _RIDGE_FRACTION = 1e-12
-# Coincident markers have no scale; any value works, since the cost of the adjustment is high anyway.
-_TINY = float(np.finfo(np.float64).tiny)
-_LEAST_SCALE = _TINY**0.5
+# Keeps the distance of coincident images finite; the cost of the adjustment is high anyway.
+_LEAST_SCALE = float(np.finfo(np.float64).tiny) ** 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ def two_fold_starts(features: Features) -> tuple[Array, Array]:
         features: B frames with at least three markers that all eyes measured, and that are not collinear.
 
     Returns:
-        rotations (B, 2, 3, 3) `left_from_drogue`, translations (B, 2, 3). [m]
+        rotations (B, 2, 3, 3) `left_from_drogue`, translations (B, 2, 3) [m]; NaN for frames with fewer markers.
     """
     camera, frames = features.camera, features.frames
     rotations, translations_m = np.empty((frames, 2, 3, 3)), np.empty((frames, 2, 3))
@@ -164,7 +163,7 @@ def _fill_affine_map(places_m: Array, measured: Array, linear: Array) -> tuple[f
             u, v = u - mean_u, v - mean_v
             xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
             xu, xv, yu, yv = xu + x * u, xv + x * v, yu + y * u, yv + y * v
-    ridge = _RIDGE_FRACTION * (xx + yy) + _TINY
+    ridge = _RIDGE_FRACTION * (xx + yy)
     xx, yy = xx + ridge, yy + ridge
     determinant = xx * yy - xy * xy
     linear[0, 0], linear[0, 1] = (yy * xu - xy * yu) / determinant, (xx * yu - xy * xu) / determinant

@@ -10,7 +10,7 @@ import pytest
 
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.matching import ring_matching
-from nav.numerics import levenberg_marquardt
+from nav.numerics import cholesky, levenberg_marquardt
 from nav.pose import adjustment_loops, tilt_pairs
 from nav.tracking import pose_predict
 
@@ -20,7 +20,7 @@ def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile() ->
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.matching import ring_matching
-from nav.numerics import levenberg_marquardt
+from nav.numerics import cholesky, levenberg_marquardt
 from nav.tracking import pose_predict
 from nav.realtime import warm_up_jit
 from nav.pair_navigator import PairNavigator
@@ -30,7 +30,8 @@ from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, levenberg_marquardt, outline_pixels, pose_predict,
+    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, cholesky, levenberg_marquardt, outline_pixels,
+             pose_predict,
              ring_matching, tilt_pairs)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
@@ -59,6 +60,7 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
         adjustment_loops,
         blurred_edges,
         centroid_uncertainty,
+        cholesky,
         levenberg_marquardt,
         outline_pixels,
         pose_predict,

@@ -7,7 +7,7 @@ import numpy as np
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from nav.matching.marker_channel import Blobs
-from nav.matching.ring_matching import _count_votes, match_ring
+from nav.matching.ring_matching import _count_votes, _nearest_alike, match_ring
 
 LAYOUT = marker_layout(PRESETS["red-8"])
 # Of a marker's radius, as the module has them.
@@ -31,6 +31,18 @@ def test_votes_are_matched_markers_and_then_their_nearness() -> None:
         gaps_px = np.abs((turn * places + shift)[:, None] - blobs[alike]).min(axis=1)
         nearness = np.maximum(0, 1 - gaps_px / (TOLERANCE * radius_px))
         np.testing.assert_allclose(vote, (nearness > 0).sum() + nearness.mean() / 2, rtol=0, atol=1e-9)
+
+
+def test_the_nearest_blob_of_a_like_size_belongs_to_a_place() -> None:
+    rng = np.random.default_rng(6)
+    places_px, centers_px = rng.uniform(0, 100, (300, 2)), rng.uniform(0, 100, (40, 2))
+    radii_px = rng.uniform(4, 20, 40)
+    gaps_px = np.hypot(*(places_px[:, None] - centers_px).transpose(2, 0, 1))
+    gaps_px[:, (radii_px >= SIZE_FACTOR * 9) | (9 >= SIZE_FACTOR * radii_px)] = np.inf
+    expected = np.where(gaps_px.min(axis=1) < 7, gaps_px.argmin(axis=1), -1)
+    assert 0 < (expected >= 0).sum() < 300
+    assert _nearest_alike(places_px, 9.0, 7.0, centers_px, radii_px).tolist() == expected.tolist()
+    assert _nearest_alike(places_px, 9.0, 7.0, centers_px[:0], radii_px[:0]).tolist() == [-1] * 300
 
 
 def test_a_ring_is_found_among_other_blobs() -> None:

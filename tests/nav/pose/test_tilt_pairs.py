@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
-from nav.pose.adjustment import inverse_information
+from nav.pose.adjustment import information_at, inverse_information
 from nav.pose.features import Features, stack_features
 from nav.pose.tilt_pairs import TiltPairs, line_of_sight_rotations, mode_weights, two_fold_starts
 from tests.support.painted_pairs import Draws, draw_poses
@@ -121,3 +122,12 @@ def test_covariances_are_inverse_information_without_what_is_marginalised() -> N
             rtol=1e-9,
             atol=1e-12,
         )
+
+
+def test_markers_on_a_line_determine_no_pose(draws: Draws) -> None:
+    on_a_line = MarkerLayout(np.linspace(-1, 1, 6)[:, None] * np.array([0.25, 0.1, 0.0]), 0.04, None)
+    rng = np.random.default_rng(7)
+    rotations = Rotation.from_rotvec(rng.normal(size=(50, 3)) * 0.3).as_matrix()
+    places_m = np.column_stack([rng.uniform(-1, 1, (50, 2)), rng.uniform(2, 40, 50)])
+    features = stack_features(draws.rig, on_a_line, np.full((50, 2, 6, 2), 500.0), 0.01 * np.eye(2))
+    assert not inverse_information(information_at(features, rotations, places_m))[1].any()
