@@ -38,7 +38,7 @@ def test_the_nearest_blob_of_a_like_size_belongs_to_a_place() -> None:
     places_px, centers_px = rng.uniform(0, 100, (300, 2)), rng.uniform(0, 100, (40, 2))
     radii_px = rng.uniform(4, 20, 40)
     gaps_px = np.hypot(*(places_px[:, None] - centers_px).transpose(2, 0, 1))
-    gaps_px[:, (radii_px >= SIZE_FACTOR * 9) | (9 >= SIZE_FACTOR * radii_px)] = np.inf
+    gaps_px[:, (radii_px >= SIZE_FACTOR * 9) | (SIZE_FACTOR * radii_px <= 9)] = np.inf
     expected = np.where(gaps_px.min(axis=1) < 7, gaps_px.argmin(axis=1), -1)
     assert 0 < (expected >= 0).sum() < 300
     assert _nearest_alike(places_px, 9.0, 7.0, centers_px, radii_px).tolist() == expected.tolist()
