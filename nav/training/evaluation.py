@@ -42,6 +42,9 @@ _MIN_SCORE = 0.01  # average precision needs all predictions, down to scores tha
 _STATISTICS_IMAGES = 192  # their mean is uncertain by about a fourteenth of the standard deviation between images
 _STATISTICS_BATCH = 16
 _MIN_IOU = 0.5
+# Missed drogues that a box in an image without any counts for: what is mistaken for a drogue is followed, while a
+# tracker finds a missed one again in the next pair.
+_FALSE_ALARM_WEIGHT = 3.0
 
 
 def to_tensor(images: NDArray[np.uint8], compute: ComputeDevice) -> Tensor:
@@ -240,8 +243,8 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
     """The score threshold with the fewest errors, if the detector reports the best box of each image.
 
     Errors are wrong boxes and missed drogues. A wrong box in an image without a drogue has more weight the fewer such
-    images there are, so that the rates matter and not how many of them a dataset has. Some hundred images do not
-    determine one threshold: many differ from the best by no more than chance, and the middle of their range is taken.
+    images there are, so that the rates matter and not how many of them a dataset has, and counts three times. Some
+    hundred images do not determine one threshold: many differ from the best by no more than chance, and the middle of their range is taken.
 
     Args:
         truth: for each image (n, 4) boxes of all drogues in it.
@@ -262,7 +265,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
         return otherwise
     shown = sum(len(own) > 0 for own in truth)
     # A missed drogue has the weight of a wrong box in an image with a drogue.
-    weight = shown / max(len(truth) - shown, 1)
+    weight = _FALSE_ALARM_WEIGHT * shown / max(len(truth) - shown, 1)
     false = np.cumsum([(1.0 if shows else weight) * (not is_right) for _, shows, is_right in best])
     wrong = (shown - right) + false
     # The standard deviation of a number of rare events is its square root.

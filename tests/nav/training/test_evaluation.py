@@ -74,10 +74,13 @@ def test_the_threshold_is_the_middle_of_those_that_differ_by_chance() -> None:
     mixed = [(0.8, False), (0.7, True), (0.6, False), (0.5, True), (0.4, False), (0.3, True), (0.2, False)]
     truth = [BOX] * 9 + [BOX if is_right else empty for _, is_right in mixed] + [BOX]
     predictions = [found(score) for score in right] + [found(score) for score, _ in mixed] + [NONE]
-    # As many images without a drogue as with one, thirteen each.
+    # Thrice as many images without a drogue as with one, of which there are thirteen: a box in them counts once.
+    many = truth + [empty] * 35, predictions + [NONE] * 35
+    assert best_threshold(*many, 0.1) == pytest.approx(right[7] / 2)
+    # With as many of both it counts three times: lower thresholds are worse by more than chance.
     even = truth + [empty] * 9, predictions + [NONE] * 9
-    assert best_threshold(*even, 0.1) == pytest.approx(right[7] / 2)
-    # With four, a box in one of them has the weight 13 / 4: lower thresholds are worse by more than chance.
+    assert best_threshold(*even, 0.1) == pytest.approx((right[7] + 0.8) / 2)
+    # With four, a box in one of them has the weight 3 x 13 / 4.
     assert best_threshold(truth, predictions, 0.1) == pytest.approx((right[7] + 0.8) / 2)
 
 
