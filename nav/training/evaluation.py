@@ -242,9 +242,10 @@ def average_precision(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes
 def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]], otherwise: float) -> float:
     """The score threshold with the fewest errors, if the detector reports the best box of each image.
 
-    Errors are wrong boxes and missed drogues. A wrong box in an image without a drogue has more weight the fewer such
-    images there are, so that the rates matter and not how many of them a dataset has, and counts three times. Some
-    hundred images do not determine one threshold: many differ from the best by no more than chance, and the middle of their range is taken.
+    Errors are wrong boxes and missed drogues. A wrong box in an image without a drogue counts three times, and has more
+    weight the fewer such images there are, so that the rates matter and not how many of them a dataset has. Some
+    hundred images do not determine one threshold: many differ from the best by no more than chance, and the middle of
+    their range is taken.
 
     Args:
         truth: for each image (n, 4) boxes of all drogues in it.

@@ -41,8 +41,10 @@ Flying = tuple[subprocess.Popen[str], BinaryIO]
 
 PAIRS = 6
 WIDTH, HEIGHT, FOCAL_PX, BASELINE_M = 640, 480, 3200 / 3, 0.12
-METHODS = ["--method", "joint", "--method", "paper"]
-TRACKED = ["--method", "joint-hub", "--tracker", "bernoulli", "--filter", "--smooth"]
+# A drawn disc has neither a hole nor a hose, and to a network is no drogue for sure.
+BY_COLOR = ["--detector", "color-blob"]
+METHODS = [*BY_COLOR, "--method", "joint", "--method", "paper"]
+TRACKED = [*BY_COLOR, "--method", "joint-hub", "--tracker", "bernoulli", "--filter", "--smooth"]
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +302,7 @@ def test_a_full_disk_ends_the_run_and_leaves_whole_lines(
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
     command = [sys.executable, "-m", "droguekit.cli.main", *live(video, calibration, out, "--method", "joint")]
-    command += ["--detector", "color-blob"]  # to the networks the drawn disc is no drogue
+    command += BY_COLOR
     done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit)
     count = len(list(read_estimates(out)))
     assert done.returncode == FAULT

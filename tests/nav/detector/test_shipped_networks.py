@@ -13,14 +13,19 @@ from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
-from studies.detector_weights.__main__ import FLAT
+from studies.detector_weights.corpora import FLAT, ROUND
 
 NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs/reference/detectors.md"
 # Those that do not ship with the package.
-MORE_SCENES = str(ROOT / "studies/detector_weights/more-scenes.toml")
-RECIPES = {"detector-weights": (MORE_SCENES, {}), "detector-flat": ("detector-small", FLAT)}
+STUDY = ROOT / "studies/detector_weights"
+RECIPES = {
+    "detector-weights": (str(STUDY / "more-scenes.toml"), {}),
+    "detector-missed": (str(STUDY / "missed-scenes.toml"), {}),
+    "detector-round": (str(STUDY / "test.toml"), ROUND),
+    "detector-flat": ("detector-small", FLAT),
+}
 
 
 def shipped(name: str) -> OnnxDetector:

@@ -6,11 +6,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from nav.detector.detector_registry import network_file
+from nav.detector.onnx_detector import OnnxDetector
+from nav.training.training_settings import build_settings, differing_settings
 from scenes.sampler import scene_of_frame
-from studies.detector_weights.__main__ import MORE_SCENES, frames_of_first_scenes, score_lines
+from studies.detector_weights.__main__ import score_lines
+from studies.detector_weights.corpora import MORE_SCENES, TRAININGS, datasets, frames_of_first_scenes
 
 
 def test_the_second_corpus_has_whole_scenes() -> None:
@@ -19,6 +23,30 @@ def test_the_second_corpus_has_whole_scenes() -> None:
     scenes = [scene_of_frame(recipe, index) for index in frames]
     assert len(set(scenes)) == MORE_SCENES
     assert {scenes.count(scene) for scene in scenes} == {recipe.frames.count // recipe.frames.scenes}
+
+
+@pytest.mark.parametrize("variant", ["l", "s"])
+def test_the_shipped_weights_are_those_of_the_last_training(variant: str) -> None:
+    last, network = TRAININGS[variant][-1], network_file(f"mobile-{variant}")
+    assert network is not None
+    learned = OnnxDetector(network).metadata.training
+    own = datasets(variant)
+    names = [own[corpus][0].recipe.name for corpus in last.corpora]
+    assert [corpus["name"] for corpus in learned["datasets"]] == [*names, "photographs"]
+    settings = build_settings(last.settings(variant), {}).model_dump(mode="json")
+    # Where the training ran, and the weights that it began from; a default that has changed since is told by its value.
+    assert set(differing_settings(settings, learned["settings"])) <= {"device", "start_sha256", "small_below_px"}
+
+
+def test_each_variant_has_its_own_corpora_and_both_test_sets() -> None:
+    for variant, trainings in TRAININGS.items():
+        own = datasets(variant)
+        assert own.keys() == {name for training in trainings for name in training.corpora} | {"test", "empty"}
+        assert all(training.settings(variant).is_file() for training in trainings)
+        # No pair is in two corpora of one training.
+        for training in trainings:
+            pairs = [(own[name][0].recipe.name, index) for name in training.corpora for index in own[name][1]]
+            assert len(pairs) == len(set(pairs))
 
 
 def test_detectors_stand_side_by_side(tmp_path: Path) -> None:

@@ -1,0 +1,122 @@
+"""The corpora of the shipped weights and of their tests, and which training learns from which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
+from scenes.sampler import scene_of_frame
+
+_HERE = Path(__file__).parent
+# Of `detector-train`. The even ones behind the first 320 come from a run that was begun with more frames.
+CORPUS_FRAMES = sorted({*range(320), *range(1, 1440, 2)} | {330, 340, 370, 380, 384, 404, 424, 430})
+# Of `more-scenes.toml`: as many as its rendering had completed when the training began.
+MORE_SCENES = 217
+# Of `detector-negatives`, for the same reason.
+NEGATIVE_SCENES = 240
+# Flat rings without paths of light: pictures of a renderer that no other corpus has, at the others' size.
+FLAT = {
+    "name": "detector-flat",
+    "seed": 9,
+    "frames": {"count": 200, "scenes": 200, "empty_fraction": 0.1},
+    "rig": {
+        "preset": "rgb-ideal",
+        "encoding": "gamma",
+        "width_px": 640,
+        "height_px": 480,
+        "focal_px": 1066.6666666666667,
+    },
+    "render": {"engine": "analytic"},
+}
+# Of the later trainings of `s`: scenes of the same recipes that those before did not see, or fewer of them.
+LATER_CORPUS = {"frames": {"count": 560, "scenes": 140}}
+LATER_SCENES, LATER_NEGATIVE_SCENES = 417, 400
+# Of `missed-scenes.toml`: as many as its rendering had completed when the training began.
+MISSED_SCENES = 83
+# Round things that detectors take for drogues, in frames without one, and many of them to validate with.
+ROUND = {
+    "name": "detector-round",
+    "seed": 11,
+    "frames": {"count": 400, "scenes": 134, "empty_fraction": 1.0},
+    "target": {
+        "distractor_frame_fraction": 0.75,
+        "distractor_forms": ["roundel"] * 4
+        + ["wheel"] * 2
+        + ["nacelle", "intake", "antenna", "lamp", "bird", "pod", "ring", "disc"],
+    },
+    "split": {"train": 0.6, "val": 0.4, "test": 0},
+}
+# Beside the photographs from the third training on.
+PLAIN_GROUNDS = 24
+# Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
+EMPTY = {"name": "detector-empty", "seed": 5, "frames": {"count": 300, "scenes": 100, "empty_fraction": 1.0}}
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of several, each from the weights of the one before it.
+
+    Attributes:
+        name: of its settings and its folder, behind that of the network's variant.
+        corpora: folders of the datasets that it learns from.
+        has_grounds: whether drogues are pasted on plain grounds too.
+    """
+
+    name: str
+    corpora: tuple[str, ...]
+    has_grounds: bool = False
+
+    def settings(self, variant: str) -> Path:
+        """The file of its settings for a network's variant."""
+        return _HERE / f"{variant}-{self.name}.toml"
+
+
+_FIRST, _SECOND = ("corpus", "more"), ("corpus", "more", "negatives", "flat")
+_FOURTH = ("later-corpus", "later-more", "later-negatives", "missed", "flat")
+_THREE = (Training("first", _FIRST), Training("second", _SECOND), Training("third", _SECOND, has_grounds=True))
+# A fifth training led nowhere, see RESULTS.md.
+TRAININGS: dict[str, tuple[Training, ...]] = {
+    "l": _THREE,
+    "s": (
+        *_THREE,
+        Training("fourth", _FOURTH, has_grounds=True),
+        Training("sixth", (*_FOURTH, "negatives", "round"), has_grounds=True),
+    ),
+}
+
+
+def frames_of_first_scenes(recipe: Recipe, scenes: int) -> list[int]:
+    """Indices of all frames of the scenes that the first frames show, one each."""
+    first = {scene_of_frame(recipe, index) for index in range(scenes)}
+    return [index for index in range(recipe.frames.count) if scene_of_frame(recipe, index) in first]
+
+
+def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
+    """Recipe and frames of the folders that a variant's trainings and their test need."""
+    more, negatives = load_recipe(str(_HERE / "more-scenes.toml")), load_recipe("detector-negatives")
+    missed, test = load_recipe(str(_HERE / "missed-scenes.toml")), str(_HERE / "test.toml")
+    whole = {
+        "flat": load_recipe("detector-small", changes=FLAT),
+        "later-corpus": load_recipe("detector-train", changes=LATER_CORPUS),
+        "round": load_recipe(test, changes=ROUND),
+        "test": load_recipe(test),
+        "empty": load_recipe(test, changes=EMPTY),
+    }
+    every: dict[str, tuple[RecipeSource, Sequence[int]]] = {
+        "corpus": (load_recipe("detector-train"), CORPUS_FRAMES),
+        "more": (more, frames_of_first_scenes(more.recipe, MORE_SCENES)),
+        "later-more": (more, _frames_behind(more.recipe, MORE_SCENES, LATER_SCENES)),
+        "negatives": (negatives, frames_of_first_scenes(negatives.recipe, NEGATIVE_SCENES)),
+        "later-negatives": (negatives, _frames_behind(negatives.recipe, NEGATIVE_SCENES, LATER_NEGATIVE_SCENES)),
+        "missed": (missed, frames_of_first_scenes(missed.recipe, MISSED_SCENES)),
+        **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
+    }
+    needed = {name for training in TRAININGS[variant] for name in training.corpora} | {"test", "empty"}
+    return {name: dataset for name, dataset in every.items() if name in needed}
+
+
+def _frames_behind(recipe: Recipe, first: int, last: int) -> list[int]:
+    """Indices of all frames of the scenes from number `first` to before `last`."""
+    return sorted(set(frames_of_first_scenes(recipe, last)) - set(frames_of_first_scenes(recipe, first)))
