@@ -107,8 +107,6 @@ def fit_small_discs(images: StereoImages, discs: Ellipses, face: FaceBackground 
     inflation = np.maximum(chi2, 1.0)
     colors = windows.classes.shape[1]
     light, light_cov = parameters[:, 2 : 2 + colors], cov[:, 2 : 2 + colors, 2 : 2 + colors]
-    # A disc whose fit determines nothing has no strength; LAPACK would refuse all discs for it.
-    light_cov = np.where(np.isfinite(light_cov).all(axis=(1, 2), keepdims=True), light_cov, 0.0)
     # The light of all colours together, against its own uncertainty.
     strength = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", light, np.linalg.pinv(light_cov), light), 0) / inflation)
     centers = windows.middles_px + fit.places_px

@@ -7,6 +7,9 @@ import numpy as np
 from geometry.se3 import Array
 from nav.numerics.compiled import compiled
 
+# Of a unit diagonal; more would help no matrix that holds numbers.
+_MOST_DAMPING = 1.0
+
 
 @compiled
 def factorise(matrix: Array, scale: Array, damping: float, lower: Array) -> float:
@@ -75,11 +78,16 @@ def invert(lower: Array, scale: Array, root: Array, inverse: Array) -> None:
 
 @compiled
 def inverses(matrices: Array, scales: Array, damping: float) -> Array:
-    """(N, P, P) inverses of matrices with scales (N, P); not finite for those that are not positive definite."""
+    """(N, P, P) inverses of matrices with scales (N, P) that bring their diagonals to one.
+
+    A matrix that rounding has left indefinite gets ten times the damping, and as often as it needs that.
+    """
     inverted, size = np.empty_like(matrices), matrices.shape[1]
     lower, root = np.empty((size, size)), np.empty((size, size))
     for n in range(len(matrices)):
-        factorise(matrices[n], scales[n], damping, lower)
+        own = damping
+        while not factorise(matrices[n], scales[n], own, lower) > 0 and own < _MOST_DAMPING:
+            own *= 10
         invert(lower, scales[n], root, inverted[n])
     return inverted
 

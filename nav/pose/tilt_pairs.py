@@ -207,7 +207,7 @@ def _fill_nearest_rotation(columns: Array, rotation: Array) -> None:
 def line_of_sight_rotations(directions: Array) -> Array:
     """(B, 3, 3) smallest rotations from the optical axis to (B, 3) directions with positive z."""
     rotations = np.empty((len(directions), 3, 3))
-    _fill_lines_of_sight(np.require(directions, np.float64, ["C", "W"]), rotations)
+    _fill_lines_of_sight(contiguous(directions), rotations)
     return rotations
 
 

@@ -1,4 +1,4 @@
-"""The compiled loops of Cholesky's decomposition against numpy."""
+"""The compiled loops of Cholesky's decomposition against numpy. Tolerances are rounding."""
 
 from __future__ import annotations
 
@@ -36,6 +36,18 @@ def test_inverses_are_those_of_the_damped_matrices() -> None:
     factorise(matrices[0], scales[0], 0.0, lower)
     invert(lower, scales[0], np.empty((9, 9)), part)
     np.testing.assert_allclose(part, np.linalg.inv(matrices[0])[:4, :4], rtol=1e-9, atol=1e-12)
+
+
+def test_what_rounding_has_left_indefinite_has_a_finite_inverse_too() -> None:
+    matrices = np.broadcast_to(np.eye(3), (3, 3, 3)).copy()
+    # Least eigenvalues of -2e-6 and 1e-3: the first needs more than a millionth on its diagonal, the second does not.
+    matrices[0, 0, 1] = matrices[0, 1, 0] = 1 + 2e-6
+    matrices[1, 0, 1] = matrices[1, 1, 0] = 1 - 1e-3
+    matrices[2, 1, 1] = np.nan
+    found = inverses(matrices, np.ones((3, 3)), 1e-6)
+    np.testing.assert_allclose(found[0], np.linalg.inv(matrices[0] + 1e-5 * np.eye(3)), rtol=1e-6)
+    np.testing.assert_allclose(found[1], np.linalg.inv(matrices[1] + 1e-6 * np.eye(3)), rtol=1e-9)
+    assert not np.isfinite(found[2]).all()
 
 
 @pytest.mark.parametrize("least", [0.5, 1e-3, -1e-3])

@@ -246,6 +246,19 @@ def test_observation_checks_the_hub(draws: Draws) -> None:
         Observation(good.rig, bare, good.pixels_px, good.cov_px2, good.hub_px, good.hub_cov_px2)
 
 
+def test_masks_of_what_was_measured_follow_the_pixels_and_cannot_be_changed(draws: Draws) -> None:
+    count, pixels = draws.layout.count, draws.pixels_px[0].copy()
+    pixels[1, 2] = np.nan
+    every = np.broadcast_to(0.0025 * np.eye(2), (*pixels.shape, 2))
+    parts = pixels[:, :count], every[:, :count], pixels[:, count:], every[:, count:]
+    observation = Observation(draws.rig, draws.layout, *parts)
+    masks = observation.seen, observation.hub_seen, observation.paired
+    assert np.argwhere(~masks[0]).tolist() == [[1, 2]] and masks[1].all()
+    assert np.flatnonzero(~masks[2]).tolist() == [2]
+    assert not any(mask.flags.writeable for mask in masks)
+    assert replace(observation, pixels_px=draws.pixels_px[0, :, :count]).seen.all()
+
+
 @pytest.mark.parametrize("name", ["ring_radius_m", "ellipticity", "placement_m", "hub_lateral_m", "disparity_px"])
 @pytest.mark.parametrize("value", [-1e-3, np.nan, np.inf])
 def test_a_tolerance_is_a_size(name: str, value: float) -> None:

@@ -1,4 +1,4 @@
-"""Starts and weights of the two tilts against closed forms and numpy."""
+"""Starts, weights and mean of the two tilts against closed forms and numpy. Tolerances are rounding."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from nav.pose.adjustment import information_at, inverse_information
 from nav.pose.features import Features, stack_features
-from nav.pose.tilt_pairs import TiltPairs, line_of_sight_rotations, mode_weights, two_fold_starts
+from nav.pose.tilt_pairs import (
+    TiltPairs,
+    line_of_sight_rotations,
+    mixture_mean,
+    mode_weights,
+    two_fold_starts,
+)
 from tests.support.painted_pairs import Draws, draw_poses
 
 Z_M = 12.0
@@ -98,6 +104,23 @@ def test_impossible_and_equal_poses_have_no_weight() -> None:
     pairs.costs[3] = np.inf
     pairs.information[4, 0] = np.nan
     assert mode_weights(pairs, np.inf).tolist() == [[0, 1], [1, 0], [1, 0], [1, 0], [0, 1]]
+
+
+def test_the_mean_of_two_poses_has_the_covariance_of_their_mixture() -> None:
+    pairs, weights = _pairs(np.random.default_rng(8), 4), np.array([[1.0, 0.0], [0.7, 0.3], [0.7, 0.3], [0.5, 0.5]])
+    half_turn = Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix()
+    pairs.rotations[1, 1] = pairs.rotations[1, 0]
+    pairs.rotations[3, 1] = half_turn @ half_turn @ pairs.rotations[3, 0]
+    rotations, translations_m, covariances = mixture_mean(pairs, weights)
+    own = np.linalg.inv(pairs.information)[..., :6, :6]
+    np.testing.assert_allclose(covariances[0], own[0, 0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rotations[0], pairs.rotations[0, 0], atol=1e-12)
+    np.testing.assert_allclose(translations_m, np.einsum("bs,bsi->bi", weights, pairs.translations_m), rtol=1e-12)
+    # Of two means that are d apart, the mixture's covariance is the mean one and p (1 - p) d d^T.
+    apart = np.append(pairs.translations_m[1, 1] - pairs.translations_m[1, 0], np.zeros(3))
+    expected = 0.7 * own[1, 0] + 0.3 * own[1, 1] + 0.21 * np.outer(apart, apart)
+    np.testing.assert_allclose(covariances[1], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rotations[3], half_turn @ pairs.rotations[3, 0], atol=1e-12)
 
 
 def test_covariances_are_inverse_information_without_what_is_marginalised() -> None:
