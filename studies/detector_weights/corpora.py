@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,24 @@ ROUND = {
     },
     "split": {"train": 0.6, "val": 0.4, "test": 0},
 }
+# Of `missed-scenes.toml`, as far as multirotors carry them: cones, which detectors take for roundels, beside roundels.
+CONES = {
+    "name": "detector-cones",
+    "seed": 12,
+    "frames": {"count": 320, "scenes": 80, "empty_fraction": 0.2},
+    "split": {"train": 0.9, "val": 0.1, "test": 0},
+}
+_CONES_TARGET = {
+    "variants": [
+        {"drogue": "cone-orange", "weight": 6},
+        {"drogue": "cone-white", "weight": 6},
+        {"drogue": "cone-markers", "weight": 4},
+        {"drogue": "red-8", "weight": 2},
+    ],
+    "distractor_forms": ["roundel", "roundel", "disc", "disc", "ball", "bird", "ring", "wheel"],
+}
+# Behind the later ones of `more-scenes.toml`.
+NEWEST_SCENES = 492
 # Beside the photographs from the third training on.
 PLAIN_GROUNDS = 24
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
@@ -75,14 +94,16 @@ class Training:
 
 _FIRST, _SECOND = ("corpus", "more"), ("corpus", "more", "negatives", "flat")
 _FOURTH = ("later-corpus", "later-more", "later-negatives", "missed", "flat")
+_SIXTH = (*_FOURTH, "negatives", "round")
 _THREE = (Training("first", _FIRST), Training("second", _SECOND), Training("third", _SECOND, has_grounds=True))
 # A fifth training led nowhere, see RESULTS.md.
 TRAININGS: dict[str, tuple[Training, ...]] = {
-    "l": _THREE,
+    "l": (*_THREE, Training("fourth", _SIXTH, has_grounds=True)),
     "s": (
         *_THREE,
         Training("fourth", _FOURTH, has_grounds=True),
-        Training("sixth", (*_FOURTH, "negatives", "round"), has_grounds=True),
+        Training("sixth", _SIXTH, has_grounds=True),
+        Training("seventh", (*_SIXTH, "cones", "newest-more"), has_grounds=True),
     ),
 }
 
@@ -101,6 +122,7 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
         "flat": load_recipe("detector-small", changes=FLAT),
         "later-corpus": load_recipe("detector-train", changes=LATER_CORPUS),
         "round": load_recipe(test, changes=ROUND),
+        "cones": _cones(),
         "test": load_recipe(test),
         "empty": load_recipe(test, changes=EMPTY),
     }
@@ -110,11 +132,20 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
         "later-more": (more, _frames_behind(more.recipe, MORE_SCENES, LATER_SCENES)),
         "negatives": (negatives, frames_of_first_scenes(negatives.recipe, NEGATIVE_SCENES)),
         "later-negatives": (negatives, _frames_behind(negatives.recipe, NEGATIVE_SCENES, LATER_NEGATIVE_SCENES)),
+        "newest-more": (more, _frames_behind(more.recipe, LATER_SCENES, NEWEST_SCENES)),
         "missed": (missed, frames_of_first_scenes(missed.recipe, MISSED_SCENES)),
         **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
     }
     needed = {name for training in TRAININGS[variant] for name in training.corpora} | {"test", "empty"}
     return {name: dataset for name, dataset in every.items() if name in needed}
+
+
+def _cones() -> RecipeSource:
+    """The family of multirotors of `missed-scenes.toml` alone, with other drogues and distractors."""
+    path = _HERE / "missed-scenes.toml"
+    families = tomllib.loads(path.read_text(encoding="utf-8"))["families"]
+    family = next(each for each in families if each["name"] == "multirotor")
+    return load_recipe(str(path), changes={**CONES, "families": [{**family, "target": _CONES_TARGET}]})
 
 
 def _frames_behind(recipe: Recipe, first: int, last: int) -> list[int]:
