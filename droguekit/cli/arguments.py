@@ -106,6 +106,10 @@ WorkersOption = Annotated[
         help="Worker processes; by default as many as cores and memory allow. 0 runs in this process, for debugging.",
     ),
 ]
+PositiveWorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", help="Worker processes, at least 1; by default as many as cores and memory allow."),
+]
 DetectorOption = Annotated[
     str | None,
     typer.Option(

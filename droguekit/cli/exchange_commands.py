@@ -124,7 +124,7 @@ def import_(
 
 def export(
     dataset: DatasetArgument,
-    format_: Annotated[str, typer.Option("--format", metavar="NAME", help="One of the formats below.")],
+    format_: Annotated[str, typer.Option("--format", metavar="NAME", help="One of the formats above.")],
     out: Annotated[Path, output_option("--out", "DIR2", "Folder for the files; made if missing.")],
     images: Annotated[
         bool, typer.Option("--images", help="With coco: copy the images too, so that the folder can be moved.")

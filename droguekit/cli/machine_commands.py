@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from droguekit.cli.arguments import DeviceOption, EngineOption, WorkersOption
+from droguekit.cli.arguments import DeviceOption, EngineOption, PositiveWorkersOption
 from droguekit.cli.main import FAULT
 
 EXAMPLES = {
@@ -20,7 +20,7 @@ def bench(
     pairs: Annotated[
         int, typer.Option("--pairs", help="Pairs at distances uniform from 2 to 40 m, for each quality.")
     ] = 40,
-    workers: WorkersOption = None,
+    workers: PositiveWorkersOption = None,
     engine: EngineOption = None,
     device: DeviceOption = "cpu",
 ) -> None:

@@ -1,7 +1,7 @@
 """Compares pictures of drawn cameras with photographs, and times them.
 
 `python -m studies.drawn_cameras measure data/world-real ~/photographs`
-`python -m studies.drawn_cameras redraw data/world-89 --out out/drawn`
+`python -m studies.drawn_cameras redraw data/cloud --out out/drawn`
 `python -m studies.drawn_cameras cost`
 """
 
