@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import shutil
 import tempfile
 import uuid
@@ -17,6 +18,37 @@ MEMORY_FOLDER = Path("/dev/shm")
 
 PART_SUFFIX = ".part"
 """Suffix of everything that is still being written; such names also begin with a dot."""
+
+
+_OPEN_FILES = re.compile(r"/proc/(\d+)/fd")
+# As many links behind each other as Linux follows.
+_MOST_LINKS = 40
+
+
+def is_stream(path: Path) -> bool:
+    """Whether a path is a device, a pipe or an open file such as `/dev/stdout`: it is written to, and not replaced."""
+    return _open_file(path) is not None or (path.exists() and not path.is_file() and not path.is_dir())
+
+
+def _open_file(path: Path) -> tuple[int, int] | None:
+    """Process and number of an open file that a path names, perhaps by links; None for other paths."""
+    for _ in range(_MOST_LINKS):
+        found = _OPEN_FILES.fullmatch(os.path.realpath(path.parent))
+        if found is not None and path.name.isdecimal():
+            return int(found[1]), int(path.name)
+        if not path.is_symlink():
+            return None
+        path = path.parent / path.readlink()
+    return None
+
+
+def _write_to_stream(path: Path, part: Path) -> None:
+    """Copy a file into what `is_stream` knows."""
+    own = _open_file(path)
+    # An open file of this process is not opened once more: it would be written from its beginning.
+    target = os.dup(own[1]) if own is not None and own[0] == os.getpid() else os.open(path, os.O_WRONLY)
+    with part.open("rb") as source, os.fdopen(target, "wb") as stream:
+        shutil.copyfileobj(source, stream)
 
 
 def sync_folder(folder: Path) -> None:
@@ -59,11 +91,18 @@ def open_bytes_atomic(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _renamed_on_success(path: Path, is_synced: bool = True) -> Iterator[Path]:
-    """A temporary path, which is renamed to `path` when the block ends without an error."""
+    """A temporary path, which is renamed to `path`, or copied into a stream, when the block ends without an error."""
     part = part_path(path)
     try:
+        if is_stream(path):
+            with scratch_folder() as folder:
+                yield folder / part.name
+                _write_to_stream(path, folder / part.name)
+            return
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
+        if path.exists():
+            shutil.copymode(path, part)
         part.replace(path)
         if is_synced:
             sync_folder(path.parent)

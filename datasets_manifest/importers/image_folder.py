@@ -28,7 +28,8 @@ _VIEW_FOLDERS: Final = (
 )
 # A name says left or right at its beginning or its end.
 _SIDE = re.compile(
-    r"^(?:(?P<first>left|right|l[-_. ]|r[-_. ])[-_. ]?)?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$", re.I
+    r"^(?:(?P<first>left|right|l[-_. ]|r[-_. ])[-_. ]?)?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$",
+    re.I | re.S,
 )
 # Zeros before a whole number; those of a decimal fraction count.
 _PADDING = re.compile(r"(?<![\d.])0+(?=\d)")
@@ -288,7 +289,7 @@ def _listed_times(folder: Path, names: list[str]) -> tuple[list[int] | None, str
                 lines.pop()
             times_ns = [_line_time(line.strip()) for line in lines]
             return [times_ns[int(name)] for name in names], str(path)
-        except (OSError, ValueError, IndexError) as error:
+        except (OSError, ValueError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"{path}: must list a time a line for the files numbered from 0 (--rate ignores it): {error}"
             ) from error

@@ -260,9 +260,11 @@ def read_manifest(dataset: Location) -> Manifest:
     except FileNotFoundError as error:
         if storage.exists(BLIND_FILE):
             raise ValueError(
-                f"{dataset}: is a blind dataset, which has no truth; take the one that it came from"
+                f"{dataset}: is a blind dataset, which has no truth; it came from another one, or was imported"
             ) from error
-        raise ValueError(f"{path}: is missing; render the recipe again into this folder to complete it") from error
+        raise ValueError(
+            f"{path}: is missing; `render` into this folder completes a dataset, `import` makes one of other images"
+        ) from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -6,11 +6,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 
 from datasets_manifest.atomic import open_text_atomic
 from datasets_manifest.types.field_types import Matrix6, Transform
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.presets import explain
 from drogue_models.untrusted_files import open_regular, parse_json
 from geometry.stereo import Eye
 
@@ -203,8 +204,9 @@ def read_estimates(path: Path) -> Iterator[Estimate]:
                     continue
                 try:
                     yield _ADAPTER.validate_python(parse_json(line))
+                except ValidationError as error:
+                    raise ValueError(f"{path}, line {number}: not a pose estimate: {explain(error)}") from error
                 except ValueError as error:
-                    first = str(error).splitlines()[0]
-                    raise ValueError(f"{path}, line {number}: not a pose estimate: {first}") from error
+                    raise ValueError(f"{path}, line {number}: not JSON: {error}") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from datasets_manifest.storage.blind import BlindPair
@@ -15,6 +16,9 @@ from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.runner import open_navigator
 from nav.sequence_navigator import SequenceSettings
 from scenes.sampler import FRAME_PERIOD_S
+
+# Of 12 bits.
+_MOST_DN = 4095
 
 
 class Navigator:
@@ -32,7 +36,7 @@ class Navigator:
         rig: StereoRig,
         drogue: DrogueParameters,
         method: str = "joint-hub",
-        detector: str = DEFAULT_DETECTOR,
+        detector: str | Path = DEFAULT_DETECTOR,
         *,
         encoding: Literal["linear", "gamma"] = "linear",
         black_level_dn: float = 0.0,
@@ -57,17 +61,20 @@ class Navigator:
             filtered: whether to return the filtered pose instead of the measured one.
 
         Raises:
-            ValueError: a method, detector, tracker or way to measure centres that does not exist.
+            ValueError: a method, detector, tracker or way to measure centres that does not exist, or a black level that
+                no image has.
         """
         if centroids not in CENTROID_CHOICES:
             raise ValueError(f"centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {centroids!r}")
         if encoding not in ("linear", "gamma"):
             raise ValueError(f"encoding: must be linear or gamma, got {encoding!r}")
+        if not 0 <= black_level_dn <= _MOST_DN:
+            raise ValueError(f"black_level_dn: must be from 0 to {_MOST_DN}, got {black_level_dn}")
         self.rig, self.drogue = rig, drogue
         self._encoding: Literal["linear", "gamma"] = encoding
         self._black_level_dn = black_level_dn
         settings = SequenceSettings((method,), centroids, tracker, filtered=filtered)
-        self._navigator = open_navigator(settings, detector)
+        self._navigator = open_navigator(settings, str(detector))
         self._next_index = 0
 
     def __call__(self, left: Pixels, right: Pixels, *, time_s: float | None = None) -> Estimate:
@@ -82,8 +89,11 @@ class Navigator:
             A `PoseEstimate`, or a `NoFix` with the reason.
 
         Raises:
-            ValueError: arrays of another type, or of different shapes.
+            ValueError: arrays of another type, of different shapes, or with more than 12 bits.
         """
+        most_dn = max((int(each.max()) for each in (left, right) if each.dtype == "uint16"), default=0)
+        if most_dn > _MOST_DN:
+            raise ValueError(f"images: must have 12 significant bits in the low end of uint16, got the value {most_dn}")
         return self.estimate(
             StereoImages(
                 left=left,

@@ -208,7 +208,7 @@ class StereoDataset(Sequence[StereoPair]):
 
         Args:
             path: folder or URL.
-            frame_indices: keep only these pairs; all of them when None.
+            frame_indices: keep only these pairs, in this order; all of them when None.
 
         Raises:
             ValueError: no such place, nothing in it that can be trusted, or a pair that it does not have.
@@ -221,7 +221,7 @@ class StereoDataset(Sequence[StereoPair]):
         unknown = [] if frame_indices is None else sorted(set(frame_indices) - set(known))
         if unknown:
             raise ValueError(f"{self.path}: has no pair {unknown[0]}")
-        self.frame_indices: tuple[int, ...] = known if frame_indices is None else tuple(sorted(set(frame_indices)))
+        self.frame_indices: tuple[int, ...] = known if frame_indices is None else tuple(dict.fromkeys(frame_indices))
 
     def __repr__(self) -> str:
         """Place and number of pairs."""

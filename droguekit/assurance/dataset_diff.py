@@ -141,6 +141,9 @@ def diff_datasets(a: Location, b: Location, pairs: int = 24, report: ProgressRep
         raise ValueError(f"--pairs: must not be negative, got {pairs}")
     sources = Dataset(a), Dataset(b)
     first, second = (_read(source, report) for source in sources)
+    for source, read in zip((a, b), (first, second), strict=True):
+        if not read.drawn:
+            raise ValueError(f"{source}: has no pairs")
     common = [k for k, drawn in first.drawn.items() if second.drawn.get(k) == drawn]
     are_same = 0 < len(common) == len(first.drawn) == len(second.drawn)
     chosen = [_evenly(common, pairs) if are_same else _of_each_scene(read.drawn, pairs) for read in (first, second)]
@@ -276,7 +279,8 @@ PIXEL_MEASURES: dict[str, Callable[[NDArray[np.float32]], float]] = {
 
 def _evenly(indices: list[int], count: int) -> list[int]:
     """At most `count` of the indices, the first and the last among them."""
-    return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, count).astype(int))]
+    least = min(count, len(indices))
+    return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, least).astype(int))] if least else []
 
 
 def _of_each_scene(drawn: Mapping[int, _Drawn], count: int) -> list[int]:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,46 +15,6 @@ if TYPE_CHECKING:
 else:
     # typer knows no unions, and prints the names of types.
     Place = type("folder or URL", (), {})
-
-
-def output_option(name: str, metavar: str, help: str) -> Any:
-    """An option of type `Path` for an output file or folder on this machine.
-
-    A URL, and a place that cannot be written, are refused before the command does its work.
-    """
-    return typer.Option(name, metavar=metavar, parser=str, callback=_local_path, help=help)
-
-
-def _local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
-    if text is None:
-        return None
-    if "://" in text:
-        raise ValueError(f"{option.opts[0]}: must be a folder or file of this machine, got {text}")
-    path, is_folder = Path(text), str(option.metavar).startswith("DIR")
-    try:
-        if not is_folder and path.is_dir():
-            raise ValueError(f"{option.opts[0]}: must be a file, got the folder {path}")
-        reason = _why_unwritable(path, is_folder)
-    except OSError as error:  # a name that is too long, or a folder that nobody may look into
-        reason = error.errno
-    if reason is not None:
-        raise OSError(f"{path}: cannot be written: {os.strerror(reason)}")
-    return path
-
-
-def _why_unwritable(path: Path, is_folder: bool) -> int | None:
-    """The error's number of a place that surely cannot be written; None where it may succeed."""
-    if path.exists():
-        if is_folder and not path.is_dir():
-            return errno.ENOTDIR
-        if not is_folder and not path.is_file():
-            return None  # a device or pipe, which is opened and not replaced
-    folder = path if is_folder else path.parent
-    while not folder.exists():
-        folder = folder.parent
-    if not folder.is_dir():
-        return errno.ENOTDIR
-    return None if os.access(folder, os.W_OK | os.X_OK) else errno.EACCES
 
 
 def exit_with_fault(fault: str | None) -> None:

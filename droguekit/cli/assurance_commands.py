@@ -10,8 +10,9 @@ from pydantic import BaseModel
 
 from datasets_manifest.storage.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, Place, exit_with_fault, output_option
+from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, Place, exit_with_fault
 from droguekit.cli.main import FAULT
+from droguekit.cli.outputs import output_option
 
 EXAMPLES = {
     "coverage": (
@@ -143,6 +144,8 @@ def mine(
     from datasets_manifest.recipe.recipe import parse_recipe
     from droguekit.assurance.hard_example_mining import MiningChoices, mine_recipe, mined_lines
 
+    if out.suffix != ".toml":
+        raise ValueError(f"--out: must be a .toml file, which `render` takes, got {out}")
     choices = MiningChoices(method, kept, distance_bins, position_error, seed, count, recipe)
     boxes = () if detections is None else (detections,)
     mined = mine_recipe(dataset, out.stem, choices, estimates, boxes, progress_report())

@@ -20,12 +20,12 @@ from droguekit.cli.arguments import (
     SeedOption,
     TarOption,
     WorkersOption,
-    output_option,
     parse_frames,
     parse_shard,
     places,
 )
 from droguekit.cli.main import FAULT
+from droguekit.cli.outputs import output_option
 
 if TYPE_CHECKING:
     from datasets_manifest.release.publication import PublishedComparison

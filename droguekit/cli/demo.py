@@ -9,8 +9,9 @@ import typer
 
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DeviceOption, RecipeArgument, WorkersOption, output_option
+from droguekit.cli.arguments import DeviceOption, RecipeArgument, WorkersOption
 from droguekit.cli.main import FAULT
+from droguekit.cli.outputs import output_option
 from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import navigate_dataset
 from droguekit.workflows.rendering import open_recipe, render_frames

@@ -10,7 +10,8 @@ import typer
 
 from datasets_manifest.storage.pair_faults import PairFaults
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, exit_with_fault, output_option
+from droguekit.cli.arguments import DatasetArgument, exit_with_fault
+from droguekit.cli.outputs import output_option
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperGroup
 
+from droguekit.cli.outputs import CheckedCommand
 from droguekit.output_streams import guard_standard_streams, printable
 
 DONE, FAULT, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -30,6 +31,8 @@ class Command(NamedTuple):
     summary: str
 
 
+# Commands that continue where they stopped.
+_GO_ON = ("demo", "render", "train")
 COMMANDS = {
     "new": Command("droguekit.cli.dataset_commands", "Write a commented drogue, rig or recipe to start from."),
     "plan": Command(
@@ -104,7 +107,9 @@ def load_command(name: str) -> Any:
     # The backspace keeps the help's line breaks.
     epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(name=name, epilog=epilog, short_help=chosen.summary, no_args_is_help=False)(function)
+    app.command(name=name, cls=CheckedCommand, epilog=epilog, short_help=chosen.summary, no_args_is_help=False)(
+        function
+    )
     return typer.main.get_command(app)
 
 
@@ -185,7 +190,8 @@ def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit
     except SystemExit as exit_:
         code = exit_.code if isinstance(exit_.code, int) else DONE if exit_.code is None else WRONG_INPUT
         if code == INTERRUPTED:
-            print(f"{name}: interrupted; run the same command to continue", file=sys.stderr)
+            goes_on = bool(arguments) and arguments[0] in _GO_ON
+            print(f"{name}: interrupted{'; run the same command to continue' * goes_on}", file=sys.stderr)
         return code
     except Exception as error:
         if debug:

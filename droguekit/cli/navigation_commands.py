@@ -15,8 +15,8 @@ from droguekit.cli.arguments import (
     Place,
     WorkersOption,
     exit_with_fault,
-    output_option,
 )
+from droguekit.cli.outputs import output_option
 
 EXAMPLES = {
     "detect": (
@@ -146,9 +146,7 @@ def train(
     settings: Annotated[
         Path | None, typer.Option("--settings", metavar="FILE", help="TOML of settings, which options here override.")
     ] = None,
-    cache: Annotated[
-        Path | None, typer.Option("--cache", metavar="DIR", help="For resized images; OUT/cache by default.")
-    ] = None,
+    cache: Annotated[Path | None, output_option("--cache", "DIR", "For resized images; OUT/cache by default.")] = None,
     start_from: Annotated[
         str | None,
         typer.Option(

@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from datasets_manifest.atomic import part_path, sync_folder
-from droguekit.cli.arguments import DatasetArgument, WorkersOption, output_option, parse_frames
+from droguekit.cli.arguments import DatasetArgument, WorkersOption, parse_frames
 from droguekit.cli.main import FAULT
+from droguekit.cli.outputs import output_option
 
 EXAMPLES = {
     "preview": (

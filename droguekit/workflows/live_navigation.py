@@ -164,9 +164,9 @@ def navigate_live(
                     fixes[estimate.method] += estimate.status == "fix"
             except OSError as error:
                 fault = error.strerror or str(error)
-        if not tally.pairs and pairs.fault is not None:
+        if not tally.pairs:
             file.remove()
-            raise ValueError(pairs.fault)
+            raise ValueError(pairs.fault or f"--live: {live.source}: delivered no pair")
         latency = tally.report(pairs.rate_hz, dict(pairs.source.left_out))
         if options.latency_out is not None:
             try:

@@ -235,6 +235,8 @@ def navigate_dataset(
     settings = sequence_settings(methods, options)
     check_places(out, options.latency_out)
     blind = BlindDataset(dataset)
+    if not blind.frame_indices:
+        raise ValueError(f"{dataset}: has no pairs")
     tally = None if options.rate_hz is None else LatencyTally()
     fixes, faults = Counter[str](), PairFaults()
     opened = _estimate_pairs(blind, settings, options)

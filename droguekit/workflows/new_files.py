@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,17 +25,17 @@ _DROGUE = """# A drogue. Use it as `drogue = "{file}"` in a recipe, and look at 
 name = "{name}"
 
 # Outermost radius, radius of the face's opening, and radius of the tube around the rim.
-rim_radius_m = {rim:g}
-face_inner_radius_m = {inner:g}
-rim_tube_radius_m = {tube:g}
+rim_radius_m = {rim:.15g}
+face_inner_radius_m = {inner:.15g}
+rim_tube_radius_m = {tube:.15g}
 
 # An even ring of markers. For any other layout write marker_positions_m = [[x, y], ...] instead of these two.
 marker_count = {markers}
-marker_ring_radius_m = {ring:g}
-marker_radius_m = {radius:g}
+marker_ring_radius_m = {ring:.15g}
+marker_radius_m = {radius:.15g}
 
 # Lamps shine with this luminance [cd/m2], 0 stands for paint. By day a clear sky has 2000 to 10,000 cd/m2.
-marker_luminance_cd_m2 = {luminance:g}
+marker_luminance_cd_m2 = {luminance:.15g}
 marker_emission_rgb = [1.0, 1.0, 1.0]
 marker_reflectance_rgb = [0.8, 0.8, 0.8]
 
@@ -44,13 +46,13 @@ marker_reflectance_rgb = [0.8, 0.8, 0.8]
 """
 _RIG = """# A stereo rig. Use it as `rig = "{file}"` in a recipe.
 # The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/conventions.md lists them.
-preset = "{preset}"
+preset = {preset}
 
 # Size of an image, focal length over pixel pitch, and distance of the cameras.
 width_px = {width}
 height_px = {height}
-focal_px = {focal:g}
-baseline_m = {baseline:g}
+focal_px = {focal:.15g}
+baseline_m = {baseline:.15g}
 
 # 8, or 12 in files of 16 bits, which most viewers show as black; `droguekit preview` shows them.
 output_bits = {bits}
@@ -69,8 +71,8 @@ _RECIPE = """# A recipe. `droguekit check {file}` predicts how well the markers 
 # `droguekit plan {file}` how long it takes, and `droguekit render {file} --out data/{name}` makes it.
 # docs/reference/recipe-keys.md explains every key.
 name = "{name}"
-drogue = "{drogue}"
-rig = "{rig}"
+drogue = {drogue}
+rig = {rig}
 
 [frames]
 count = {pairs}
@@ -79,8 +81,8 @@ scenes = {scenes}
 # Distance of the rim's centre: all sizes in the image equally likely.
 [distance]
 law = "log-uniform"
-low_m = {low:g}
-high_m = {high:g}
+low_m = {low:.15g}
+high_m = {high:.15g}
 
 # By day: elevation of the sun. -4 is dusk, -18 night.
 [environment]
@@ -124,7 +126,7 @@ def write_new_file(kind: Literal["drogue", "rig", "recipe"], out: Path, choices:
         ValueError: the file exists, or numbers that do not fit together; names the key.
         OSError: it cannot be written.
     """
-    if out.suffix != ".toml":
+    if out.suffix != ".toml" or not out.name.isprintable():
         raise ValueError(f"--out: must be a .toml file, got {out}")
     if out.exists():
         raise ValueError(f"--out: {out} is there already; name another file, or delete this one")
@@ -137,12 +139,24 @@ def write_new_file(kind: Literal["drogue", "rig", "recipe"], out: Path, choices:
     elif kind == "rig":
         resolve_rig(read_rig_file(text, str(out)))
     else:
+        out.parent.mkdir(parents=True, exist_ok=True)  # files are named as seen from there
         parse_recipe(text, out.parent)
     write_text_atomic(out, text)
 
 
 def _name(out: Path) -> str:
-    return "".join(each if each.isalnum() else "-" for each in out.stem.lower()).strip("-") or "mine"
+    return "".join(each if each.isascii() and each.isalnum() else "-" for each in out.stem.lower()).strip("-") or "mine"
+
+
+def _text(words: str) -> str:
+    """A TOML string, which JSON writes alike."""
+    return json.dumps(words, ensure_ascii=False)
+
+
+def _file_or_name(choice: str, out: Path) -> str:
+    """A TOML string of a preset's name, or of a file as seen from the folder of the new one."""
+    is_file = choice.endswith(".toml") and not Path(choice).is_absolute()
+    return _text(os.path.relpath(choice, out.parent) if is_file else choice)
 
 
 def _drogue_text(out: Path, choices: FileChoices) -> str:
@@ -168,9 +182,9 @@ def _rig_text(out: Path, choices: FileChoices) -> str:
         raise ValueError(f"--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {choices.size!r}")
     return _RIG.format(
         file=out.name,
-        preset=choices.preset,
-        width=width,
-        height=height,
+        preset=_text(choices.preset),
+        width=int(width),
+        height=int(height),
         focal=choices.focal_px,
         baseline=choices.baseline_m,
         bits=choices.bits,
@@ -186,8 +200,8 @@ def _recipe_text(out: Path, choices: FileChoices) -> str:
     return _RECIPE.format(
         file=out.name,
         name=_name(out),
-        drogue=choices.drogue,
-        rig=choices.rig,
+        drogue=_file_or_name(choices.drogue, out),
+        rig=_file_or_name(choices.rig, out),
         pairs=choices.pairs,
         scenes=max(1, choices.pairs // 10),
         low=low_m,

@@ -42,6 +42,7 @@ def render_timing_lines(
     workers = default_workers(device) if workers is None else workers
     if workers < 1:
         raise ValueError(f"--workers: must be at least 1, got {workers}")
+    uniform = {quality: open_uniform_recipe(pairs, quality, engine) for quality in QUALITIES}
     recipe = open_stations_recipe(repeat, engine)
     engine_notice(recipe.render.engine, device)
     # The farthest first: the pair that is not counted is the cheapest.
@@ -49,12 +50,11 @@ def render_timing_lines(
     yield from _stations_table(recipe, tuple(frame.report for frame in measured))
     yield f"\n{'2 to 40 m':>9} {'CPU s/pair':>11} {'noise/sensor':>13} {'memory [MB]':>12} {'growth':>8}"
     for quality in QUALITIES:
-        uniform = open_uniform_recipe(pairs, quality, engine)
-        yield _mean_row(quality, measure_frames(uniform, tuple(range(pairs)), device))
+        yield _mean_row(quality, measure_frames(uniform[quality], tuple(range(pairs)), device))
     yield f"\n{'2 to 40 m':>9} {'pairs/s by the clock':>20} {'workers':>8}"
     for quality in QUALITIES:
-        uniform = open_uniform_recipe(pairs + warm_up_frames(workers), quality, engine)
-        yield f"{quality:>9} {frames_per_second(uniform, workers, device):20.2f} {workers:8d}"
+        longer = open_uniform_recipe(pairs + warm_up_frames(workers), quality, engine)
+        yield f"{quality:>9} {frames_per_second(longer, workers, device):20.2f} {workers:8d}"
 
 
 def open_stations_recipe(repeat: int, engine: str | None) -> Recipe:

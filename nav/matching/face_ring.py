@@ -85,6 +85,8 @@ def fit_face_ring(channel: Pixels, layout: MarkerLayout, center_px: Array, scale
     outer_m = layout.face_outer_radius_m
     chosen = (radius_m > _INNERMOST * layout.face_inner_radius_m) & (radius_m < _OUTERMOST * outer_m)
     picture = _Picture(part[chosen], x[chosen], y[chosen], layout)
+    if np.ptp(picture.values) == 0:
+        return None  # an even picture, such as the colour of a grey camera's, leaves no equation to solve
     affine = _descend(picture, affine, with_lamps=False)
     turns = _turns(layout, affine)
     misfits = [picture.misfit(_turned(affine, turn), with_lamps=True)[0] for turn in turns]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datasets_manifest.storage.storage import as_location
-from droguekit.cli.arguments import Place, exit_with_fault, output_option
+from droguekit.cli.arguments import Place, exit_with_fault
+from droguekit.cli.outputs import output_option
 
 if TYPE_CHECKING:
     from studies.paper.paper_report import DatasetWithEstimates, ReportInputs

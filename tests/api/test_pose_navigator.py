@@ -59,6 +59,13 @@ def test_images_of_another_size_give_a_reason(smoke_dataset: Path) -> None:
     assert "the images are 32x24 px" in answer.reason
 
 
+def test_images_of_16_bits_are_refused(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    deep = dataset[0].left.astype(np.uint16) * 257
+    with pytest.raises(ValueError, match="12 significant bits in the low end of uint16"):
+        droguekit.Navigator(dataset.rig, dataset.drogue)(deep, deep)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -67,6 +74,8 @@ def test_images_of_another_size_give_a_reason(smoke_dataset: Path) -> None:
         ({"centroids": "magic"}, "centroids: must be one of own, binary, edge"),
         ({"encoding": "sepia"}, "encoding: must be linear or gamma"),
         ({"tracker": "magic"}, "magic"),
+        ({"black_level_dn": float("nan")}, "black_level_dn: must be from 0 to 4095, got nan"),
+        ({"black_level_dn": -5.0}, "black_level_dn: must be from 0 to 4095"),
     ],
 )
 def test_unknown_names_are_refused(wrong: dict[str, Any], message: str, smoke_dataset: Path) -> None:

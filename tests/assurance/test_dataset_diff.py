@@ -131,6 +131,11 @@ def test_what_cannot_be_told_is_said(dataset: Path, capsys: pytest.CaptureFixtur
     assert told.strip().endswith("the same 20 frames; pixels were not compared")
 
 
+def test_more_pairs_than_there_are_is_all_of_them(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["diff", str(dataset), str(dataset), "--pairs", "9" * 20]) == DONE
+    assert "the same pixels in the 20 compared" in capsys.readouterr().out
+
+
 def test_wrong_input_is_named(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["diff", str(dataset), str(tmp_path / "none")]) == WRONG_INPUT
     assert "none" in capsys.readouterr().err

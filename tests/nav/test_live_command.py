@@ -402,6 +402,17 @@ def test_what_makes_no_sense_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_video_without_a_whole_picture_is_told(
+    images: list[np.ndarray], calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video, out = tmp_path / "flight.mkv", tmp_path / "estimates.jsonl"
+    encode(str(video), images)
+    video.write_bytes(video.read_bytes()[:2000])
+    assert run(live(video, calibration, out, "--method", "constant")) == WRONG_INPUT
+    assert "flight.mkv: delivered no pair" in last_line(capsys)
+    assert not out.exists()
+
+
 def test_a_file_of_estimates_is_not_overwritten(
     images: list[np.ndarray], calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -200,6 +200,14 @@ def test_lamps_that_drown_in_the_sky_are_placed_by_the_picture_of_all_of_them(sc
         assert off < 0.15
 
 
+@pytest.mark.parametrize("level", [0, 4095])
+def test_an_even_picture_shows_no_face(level: int) -> None:
+    # As the colour of the markers does in a picture of a grey camera.
+    even = np.full((160, 200), level, np.uint16)
+    assert fit_face_ring(even, FACE, np.array([102.0, 81.0]), 38.0) is None
+    assert find_face_ring(even, FACE) is None
+
+
 def test_a_face_without_lamps_and_a_sky_without_a_face_are_no_drogue() -> None:
     rng = np.random.default_rng(12)
     affine = np.column_stack([38.0 * np.eye(2), [101.3, 79.6]])

@@ -50,6 +50,21 @@ def test_numbers_that_do_not_fit_are_told_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_numbers_and_names_come_back_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["new", "rig", "--focal-px", "1745.678912", "--size", "0640x0480", "--out", "my rig.toml"]) == DONE
+    # A file is named as the command sees it, and stands in the recipe as the recipe sees it.
+    assert run(["new", "recipe", "--rig", "my rig.toml", "--out", "below/Größe.toml"]) == DONE
+    read = load_recipe("below/Größe.toml").recipe
+    assert (read.rig.camera.width_px, read.rig.camera.fx_px, read.name) == (640, 1745.678912, "gr--e")
+
+
+@pytest.mark.parametrize("drogue", ['red-8"\nseed = 5\n#', 'a"b', "a\\b"])
+def test_a_name_cannot_add_keys(drogue: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["new", "recipe", "--drogue", drogue, "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+    assert "no preset named" in capsys.readouterr().err
+
+
 def test_a_file_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.toml").write_text("mine")
     assert run(["new", "rig", "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
@@ -57,7 +72,10 @@ def test_a_file_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (tmp_path / "mine.toml").read_text() == "mine"
 
 
-def test_a_rig_file_without_a_preset_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_file_without_a_preset_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text("width_px = 640\n")
     assert run(["new", "recipe", "--rig", "rig.toml", "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
     assert "rig.toml: preset: name the shipped rig to start from" in capsys.readouterr().err

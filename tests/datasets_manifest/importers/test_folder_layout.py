@@ -167,7 +167,8 @@ def test_lists_of_times_are_read(tmp_path: Path) -> None:
     odometry = touch(tmp_path / "odometry", *(f"image_{eye}/00000{n}.png" for eye in (0, 1) for n in (0, 2)))
     (odometry / "times.txt").write_text("0.000000e+00\n1.038800e-01\n2.078000e-01\n")
     assert find_pairs(odometry).times_s == pytest.approx([0.0, 0.2078])
-    (odometry / "times.txt").write_text("0.0\n")
-    with pytest.raises(ValueError, match=r"times\.txt: must list a time a line"):
-        find_pairs(odometry)
+    for wrong in ("0.0\n", "0.0\n1.0\n1e400\n"):
+        (odometry / "times.txt").write_text(wrong)
+        with pytest.raises(ValueError, match=r"times\.txt: must list a time a line"):
+            find_pairs(odometry)
     assert find_pairs(odometry, rate_hz=10.0).times_s == [0.0, 0.1]

@@ -47,6 +47,12 @@ def test_two_files_a_pair(names: str, tmp_path: Path) -> None:
         assert pair.time_s == pytest.approx(0.1 * place)
 
 
+def test_names_with_a_line_break(tmp_path: Path) -> None:
+    for side in ("left", "right"):
+        save(tmp_path / f"a\nb_{side}.png", picture(7))
+    assert ImageFolder(tmp_path, find_pairs(tmp_path, 10.0), WIDTH).count == 1
+
+
 def test_views_side_by_side(tmp_path: Path) -> None:
     save(tmp_path / "0001.png", np.concatenate([picture(4), picture(5)], axis=1))
     (pair,) = ImageFolder(tmp_path, find_pairs(tmp_path), WIDTH)
