@@ -101,7 +101,7 @@ def _renamed_on_success(path: Path, is_synced: bool = True) -> Iterator[Path]:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
-        if path.exists():
+        with suppress(OSError):  # there is no such file yet, or its file system has no rights
             shutil.copymode(path, part)
         part.replace(path)
         if is_synced:

@@ -66,7 +66,12 @@ def check_outputs(parameters: Mapping[str, Any]) -> None:
     for (one, place), (other, second) in combinations(places.items(), 2):
         if place == second:
             raise ValueError(f"{other}: must be another file than {one}, got {outputs[other]}")
-    inputs = [(name, each) for name, value in parameters.items() if name not in outputs for each in _existing(value)]
+    inputs = [
+        (name, each)
+        for name, value in parameters.items()
+        if name not in outputs
+        for each in _existing(value, is_argument=not name.startswith("-"))
+    ]
     for name, place in places.items():
         for source, read in inputs:
             if place == read:
@@ -84,12 +89,12 @@ def _option_of(command: TyperCommand, name: str) -> str:
     return name
 
 
-def _existing(value: Any) -> Iterator[Path]:
-    """The files and folders of this machine that a parameter names."""
+def _existing(value: Any, is_argument: bool) -> Iterator[Path]:
+    """The files and folders of this machine that a parameter names; texts of options are names of other things."""
     if isinstance(value, list | tuple):
         for each in value:
-            yield from _existing(each)
-    elif isinstance(value, str | Path):
+            yield from _existing(each, is_argument)
+    elif isinstance(value, Path) or (is_argument and isinstance(value, str)):
         try:
             path = Path(value).resolve()
             if path.exists():

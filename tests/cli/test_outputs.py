@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from droguekit.cli.main import FAULT, WRONG_INPUT, run
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from tests.support.whole_dataset import write_whole_dataset
 
 
@@ -93,6 +93,12 @@ def test_what_a_command_reads_is_not_written_over(
     assert run(arguments) == WRONG_INPUT
     assert capsys.readouterr().err.startswith(f"droguekit: error: {told}")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_folder_may_have_the_name_of_a_format(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("coco").mkdir()
+    assert run(["export", "dataset", "--format", "coco", "--out", "coco"]) == DONE
 
 
 def test_a_report_may_lie_beside_the_dataset(dataset: Path) -> None:
