@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -13,20 +12,6 @@ from pathlib import Path
 import pytest
 
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
-from tests.support.whole_dataset import write_whole_dataset
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("outputs") / "whole"
-    write_whole_dataset(folder)
-    return folder
-
-
-@pytest.fixture
-def dataset(whole: Path, tmp_path: Path) -> Path:
-    shutil.copytree(whole, tmp_path / "dataset")
-    return tmp_path / "dataset"
 
 
 def test_a_pipe_gets_what_a_file_would(dataset: Path, tmp_path: Path) -> None:

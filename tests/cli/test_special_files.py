@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -21,22 +20,8 @@ from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import StereoRig
 from labelgen.validation.dataset_checks import validate_dataset
-from tests.support.whole_dataset import write_whole_dataset
 
 Replace = Callable[[Path], None]
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("special") / "whole"
-    write_whole_dataset(folder)
-    return folder
-
-
-@pytest.fixture
-def dataset(whole: Path, tmp_path: Path) -> Path:
-    shutil.copytree(whole, tmp_path / "dataset")
-    return tmp_path / "dataset"
 
 
 def by_pipe(path: Path) -> None:
