@@ -164,7 +164,7 @@ def navigate_live(
                     fixes[estimate.method] += estimate.status == "fix"
             except OSError as error:
                 fault = error.strerror or str(error)
-        if not tally.pairs:
+        if not tally.pairs and fault is None:
             file.remove()
             raise ValueError(pairs.fault or f"--live: {live.source}: delivered no pair")
         latency = tally.report(pairs.rate_hz, dict(pairs.source.left_out))

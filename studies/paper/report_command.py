@@ -83,7 +83,7 @@ def _check_outputs(inputs: ReportInputs, html: Path | None, pdf: Path | None) ->
     """Nothing that is read or just written may be replaced.
 
     Raises:
-        ValueError: an output is an input, lies in a dataset, or is the other output.
+        ValueError: an output is an input or lies in a dataset.
     """
     navigated = [*inputs.docking, *inputs.semi_physical]
     files = [pair.estimates for pair in navigated] + ([] if inputs.detection is None else [inputs.detection])
@@ -98,8 +98,6 @@ def _check_outputs(inputs: ReportInputs, html: Path | None, pdf: Path | None) ->
             raise ValueError(f"{option}: {out} is an input and would be replaced; choose another name")
         if not folders.isdisjoint([whole, *whole.parents]):
             raise ValueError(f"{option}: {out} lies in a dataset that is read; choose another folder")
-    if html is not None and pdf is not None and html.resolve() == pdf.resolve():
-        raise ValueError(f"--html, --pdf: must be two files, got {html} for both")
 
 
 def _write(inputs: ReportInputs, html: Path | None, pdf: Path | None) -> str | None:

@@ -126,7 +126,7 @@ def test_set_up_prefers_the_named_python_then_that_of_the_environment_then_the_n
     refused = chosen_python(tmp_path, PYTHON="python3.10")
     assert refused.returncode == 2
     assert refused.stderr == (
-        "setup: PYTHON=python3.10 is none of the Pythons that droguekit is tested with: 3.14 3.13 3.12 3.11\n"
+        "setup: PYTHON=python3.10 is none of the Pythons that droguekit supports: 3.14 3.13 3.12 3.11\n"
     )
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     fake_python(tmp_path / ".venv" / "bin", "python", "3.12")

@@ -133,7 +133,10 @@ def test_commands_that_are_told_exist() -> None:
         (["--detection", "{here}/none.json", "--html", "{out}"], "none.json: cannot be read"),
         (["--detection", "{here}/bad.json", "--html", "{out}"], "bad.json: holds no detection scores"),
         (["--corpus", "{here}/none", "--html", "{out}"], "none: there is no such dataset folder"),
-        (["--corpus", "{here}/none", "--html", "{out}", "--pdf", "{here}/../{name}/out.html"], "must be two files"),
+        (
+            ["--corpus", "{here}/none", "--html", "{out}", "--pdf", "{here}/../{name}/out.html"],
+            "--pdf: must be another file than --html",
+        ),
     ],
 )
 def test_wrong_input_is_one_line(
