@@ -263,13 +263,11 @@ def check_places(out: Path, latency_out: Path | None) -> None:
     """Check the output files before the work.
 
     Raises:
-        ValueError: one is a folder, or both are the same file.
+        ValueError: one is a folder.
     """
     for option, file in (("--out", out), ("--latency", latency_out)):
         if file is not None and file.is_dir():
             raise ValueError(f"{option}: must be a file, got the folder {file}")
-    if latency_out is not None and latency_out.resolve() == out.resolve():
-        raise ValueError(f"--latency: must be another file than --out, got {latency_out}")
 
 
 def sequence_settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSettings:

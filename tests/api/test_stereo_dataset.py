@@ -71,6 +71,10 @@ def test_selections_are_those_of_the_records(pairs: StereoDataset, pairs_folder:
     assert len(set(split.values())) > 1
 
 
+def test_a_slice_keeps_its_order(pairs: StereoDataset) -> None:
+    assert pairs[::-1].frame_indices == pairs.frame_indices[::-1]
+
+
 def test_wrong_selections_are_refused(pairs: StereoDataset) -> None:
     with pytest.raises(ValueError, match="family: must be one of"):
         pairs.select(family="storm")

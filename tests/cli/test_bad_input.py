@@ -238,5 +238,5 @@ def test_estimates_that_are_none(smoke_dataset: Path, tmp_path: Path) -> None:
     estimates = tmp_path / "estimates.jsonl"
     estimates.write_text('{"status": "fix"}\n')
     result = _run("benchmark", smoke_dataset, "--estimates", estimates, "--json", tmp_path / "out.json")
-    _assert_refused(result, r"estimates\.jsonl, line 1: not a pose estimate")
+    _assert_refused(result, r"estimates\.jsonl, line 1: not a pose estimate: fix\.\S+: Field required")
     assert [path.name for path in tmp_path.iterdir()] == ["estimates.jsonl"]
