@@ -23,6 +23,7 @@ import numpy as np
 import tomlkit
 
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
+from datasets_manifest.recipe.file_names import move_file_names
 from datasets_manifest.recipe.recipe import MAX_SEED, Recipe, parse_recipe
 from datasets_manifest.storage.layout import RECIPE_FILE
 from datasets_manifest.storage.reader import Dataset
@@ -123,7 +124,7 @@ class MiningChoices:
 
 def mine_recipe(
     dataset: Location,
-    name: str,
+    out: Path,
     choices: MiningChoices,
     estimates: Path | None = None,
     detections: Sequence[Path] = (),
@@ -133,7 +134,8 @@ def mine_recipe(
 
     Args:
         dataset: with its truth and its `recipe.toml`.
-        name: of the new recipe, which also keys its random streams.
+        out: TOML file that the recipe is meant for. Its stem is the recipe's name, which also keys its random streams;
+            relative names of files are changed to be seen from its folder. The file is not written.
         choices: as named.
         estimates, detections: files of poses and of boxes; see `solved_cases`.
         report: is told of the progress, or None.
@@ -161,7 +163,8 @@ def mine_recipe(
         raise ValueError(
             f"{source.path}: recipe: has one drogue, one family and one distance; there is no law to weight"
         )
-    table["name"] = name
+    table["name"] = out.stem
+    move_file_names(table, choices.recipe.parent if choices.recipe else Path(), out.parent)
     table["seed"] = (old.seed + 1) % (MAX_SEED + 1) if choices.seed is None else choices.seed
     frames: Any = table["frames"]
     frames.pop("stream", None)

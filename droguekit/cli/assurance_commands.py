@@ -148,11 +148,11 @@ def mine(
         raise ValueError(f"--out: must be a .toml file, which `render` takes, got {out}")
     choices = MiningChoices(method, kept, distance_bins, position_error, seed, count, recipe)
     boxes = () if detections is None else (detections,)
-    mined = mine_recipe(dataset, out.stem, choices, estimates, boxes, progress_report())
+    mined = mine_recipe(dataset, out, choices, estimates, boxes, progress_report())
+    out.parent.mkdir(parents=True, exist_ok=True)  # files are named as seen from there
     parse_recipe(mined.text, out.parent)
     for line in mined_lines(mined):
         typer.echo(line)
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(out, mined.text)
     typer.echo(f"wrote {out}")
     _write_numbers(mined, json_)

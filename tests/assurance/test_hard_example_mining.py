@@ -80,7 +80,7 @@ def write_failures(dataset: Path, out: Path, hard: Callable[[PairRecord], bool] 
 
 
 def mined_of(dataset: Path, folder: Path, **choices: Any) -> MinedRecipe:
-    return mine_recipe(dataset, "harder", MiningChoices(**choices), write_failures(dataset, folder / "poses.jsonl"))
+    return mine_recipe(dataset, Path("harder.toml"), MiningChoices(**choices), write_failures(dataset, folder / "poses.jsonl"))
 
 
 def test_shares_are_what_the_objective_says(dataset: Path, tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_bins_of_a_narrow_range_stay_apart(tmp_path: Path) -> None:
     dataset = rendered(narrow, tmp_path / "narrow")
     poses = tmp_path / "poses.jsonl"
     write_failures(dataset, poses, hard=lambda record: record.frame_index % 2 == 0)
-    mined = mine_recipe(dataset, "harder", MiningChoices(distance_bins=8), poses)
+    mined = mine_recipe(dataset, Path("harder.toml"), MiningChoices(distance_bins=8), poses)
     (law,) = (law for law in mined.laws if law.of == "distance")
     assert len({place.name for place in law.bins}) == len(law.bins) == 8
     recipe = parse_recipe(mined.text)
@@ -161,6 +161,19 @@ def test_the_command_writes_a_recipe_and_tells_the_shares(
     assert "low-sun" in told and "25.0 % ->" in told and f"wrote {out}" in told
     assert out.read_text().startswith("# Mined from mined (")
     assert parse_recipe(out.read_text(), out.parent).distance.weights is not None
+
+
+def test_a_recipe_in_another_folder_finds_its_drogue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "own.toml").write_text('name = "own"\nmarker_count = 6\nmarker_ring_radius_m = 0.267\n')
+    old, out = tmp_path / "old" / "old.toml", tmp_path / "new" / "harder.toml"
+    old.write_text(text_of(drogue="own.toml", target={}))
+    dataset = tmp_path / "dataset"
+    assert run(["render", str(old), "--out", str(dataset)]) == DONE
+    poses = write_failures(dataset, tmp_path / "poses.jsonl")
+    assert run(["mine", str(dataset), "--estimates", str(poses), "--recipe", str(old), "--out", str(out)]) == DONE
+    assert parse_recipe(out.read_text(), out.parent).drogue == parse_recipe(old.read_text(), old.parent).drogue
+    capsys.readouterr()
 
 
 def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
