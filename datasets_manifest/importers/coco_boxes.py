@@ -60,8 +60,8 @@ class DrawnBoxes:
             sizes_px: (width, height) of each. [px]
 
         Raises:
-            ValueError: a name that fits several images, a box that was drawn on another size, or none of the file's
-                images is among these.
+            ValueError: a name that fits several images, a box outside its image or drawn on another size, or none of
+                the file's images is among these.
         """
         index = _NameIndex([(name, name) for name in names])
         found: dict[int, tuple[PixelBox, ...]] = {}
@@ -79,6 +79,7 @@ class DrawnBoxes:
                     f"{self.path}: {drawn.image_name} was {_size(drawn.size_px)} px when its box was drawn, and is "
                     f"{_size(size_px)} px; draw on the pictures as they are"
                 )
+            self._check_overlap(drawn, size_px)
             found[place[0]] = (*found.get(place[0], ()), drawn.box)
         if not found and (self.image_names or self.boxes):
             first = (self.image_names or (self.boxes[0].image_name,))[0]
@@ -97,8 +98,8 @@ class DrawnBoxes:
             view_size_px: (width, height) of one view. [px]
 
         Raises:
-            ValueError: an image that fits several views or has another size, two boxes in a view, or none of the boxes
-                belongs to these images.
+            ValueError: an image that fits several views or has another size, a box outside its image, two boxes in a
+                view, or none of the boxes belongs to these images.
         """
         index = _NameIndex(names)
         found: dict[tuple[int, int], PixelBox] = {}
@@ -116,6 +117,7 @@ class DrawnBoxes:
                     f"{self.path}: {drawn.image_name} was {_size(drawn.size_px)} px when its box was drawn, and the "
                     f"image is {_size(size_px)} px; draw on images of the calibrated size"
                 )
+            self._check_overlap(drawn, size_px)
             if is_side_by_side:
                 view = int(x + width / 2 >= width_px - 0.5)
                 x -= view * width_px
@@ -130,6 +132,15 @@ class DrawnBoxes:
                 f"{self.boxes[0].image_name}, and the images are {names[0][0]} and so on"
             )
         return found
+
+    def _check_overlap(self, drawn: DrawnBox, size_px: tuple[int, int]) -> None:
+        x, y, width, height = drawn.box
+        width_px, height_px = size_px
+        if not (-0.5 - width < x < width_px - 0.5 and -0.5 - height < y < height_px - 0.5):
+            raise ValueError(
+                f"{self.path}: {drawn.image_name}: the box {x + 0.5:g}, {y + 0.5:g}, {width:g}, {height:g} lies outside "
+                f"its image of {_size(size_px)} px"
+            )
 
 
 class _NameIndex:

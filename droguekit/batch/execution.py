@@ -29,6 +29,9 @@ class ExecutionOptions:
         scheduler: address of a Dask scheduler whose workers make the frames instead, or None.
         pairs_per_tar: how many frames come into a tar file; None keeps what the dataset has, folders at first.
         device: that the engine renders on.
+
+    Raises:
+        ValueError: a time limit in this process, which could not be stopped.
     """
 
     workers: int | None = None
@@ -36,6 +39,10 @@ class ExecutionOptions:
     scheduler: str | None = None
     pairs_per_tar: int | None = None
     device: Device = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.workers == 0 and self.scheduler is None and self.timeout_s is not None:
+            raise ValueError("--timeout: --workers 0 renders in this process, which sets no limit; leave one out")
 
     def worker_count(self) -> int:
         """`workers`, or the default of this machine where it is None."""

@@ -72,6 +72,7 @@ def test_a_wrong_recipe_names_file_and_key(change: tuple[str, str], message: str
         (["--timeout", "inf"], r"--timeout: must be above 0 s and at most 1e\+06 s, got inf"),
         (["--timeout", "nan"], r"--timeout: must be above 0 s and at most 1e\+06 s, got nan"),
         (["--timeout", "0"], r"--timeout: must be above 0 s"),
+        (["--timeout", "9", "--workers", "0"], r"--timeout: --workers 0 renders in this process, which sets no limit"),
     ],
 )
 def test_wrong_options_of_render(arguments: list[str], message: str, tmp_path: Path) -> None:

@@ -92,6 +92,20 @@ def test_boxes_drawn_on_smaller_copies_are_refused(tmp_path: Path) -> None:
     assert same.of_views([("left/1.png", "left/1.png")], VIEW) == {(0, 0): (0.5, 1.5, 3, 4)}
 
 
+@pytest.mark.parametrize("bbox", [[100, 2, 3, 4], [-3, 2, 3, 4], [1, 80, 3, 4], [1, -4, 3, 4]])
+def test_a_box_outside_its_image_is_refused(bbox: list[float], tmp_path: Path) -> None:
+    drawn = read_boxes(boxes(tmp_path, ("left/1.png", bbox)))
+    fault = rf"left/1\.png: the box {', '.join(map(str, bbox))} lies outside its image of 100x80 px"
+    with pytest.raises(ValueError, match=fault):
+        drawn.of_views([("left/1.png", "right/1.png")], VIEW)
+    with pytest.raises(ValueError, match=fault):
+        drawn.of_images(["left/1.png"], [VIEW])
+    # One that an edge cuts, by however little is left inside, is as it was drawn.
+    inside = [min(max(bbox[0], -2.5), 99.5), min(max(bbox[1], -3.5), 79.5), 3, 4]
+    (only,) = read_boxes(boxes(tmp_path, ("left/1.png", inside))).of_images(["left/1.png"], [VIEW]).values()
+    assert only == ((inside[0] - 0.5, inside[1] - 0.5, 3, 4),)
+
+
 def test_the_drogues_category_is_taken_or_asked_for(tmp_path: Path) -> None:
     categories = [{"id": 1, "name": "probe"}, {"id": 2, "name": "Drogue"}]
     path = boxes(tmp_path, ("1.png", [1, 2, 3, 4]), ("2.png", [5, 6, 7, 8]), categories=categories)
