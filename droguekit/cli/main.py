@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import keyword
 import logging
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -203,6 +204,8 @@ def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit
 
 def main() -> None:
     """Entry point of the installed command."""
+    # SIGTERM ends a command as Ctrl-C does: what is half written is removed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     guard_standard_streams()
     code = run(sys.argv[1:])
     try:

@@ -84,3 +84,29 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
     assert process.returncode == INTERRUPTED
     assert told.splitlines()[-1] == "droguekit: interrupted; run the same command to continue"
     assert "Traceback" not in told
+
+
+def test_a_terminated_command_leaves_nothing_half_written(tmp_path: Path) -> None:
+    (tmp_path / "stalling.py").write_text(
+        "import signal\n"
+        "from pathlib import Path\n"
+        "from datasets_manifest.atomic import new_folder\n"
+        "EXAMPLES = {'stall': ()}\n"
+        "def stall(out: Path) -> None:\n"
+        "    with new_folder(out) as folder:\n"
+        "        (folder / 'first').write_text('half')\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+    )
+    script = (
+        "import sys\n"
+        "from droguekit.cli.main import COMMANDS, Command, main\n"
+        "sys.path.append(sys.argv.pop(1))\n"
+        "COMMANDS['stall'] = Command('stalling', 'Write without an end.')\n"
+        "main()\n"
+    )
+    work = tmp_path / "work"
+    work.mkdir()
+    arguments = [sys.executable, "-c", script, str(tmp_path), "stall", str(work / "out")]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr.strip()) == (INTERRUPTED, "droguekit: interrupted")
+    assert list(work.iterdir()) == []
