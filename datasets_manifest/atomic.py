@@ -215,7 +215,7 @@ def _scratch_prefix(process: int) -> str:
     return f"droguekit-{process}-"
 
 
-def try_lock(file: IO[str]) -> bool:
+def try_lock(file: IO[Any]) -> bool:
     """Lock an open file for this process until it is closed, unless another process holds the lock.
 
     The kernel releases the lock when the process ends, in whatever way.

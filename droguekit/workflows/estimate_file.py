@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
+
+from datasets_manifest.atomic import is_stream, try_lock
 
 if TYPE_CHECKING:
     from datasets_manifest.types.estimates import Estimate
@@ -27,16 +29,35 @@ class EstimateFile:
         self._part = path.with_name(path.name + PART_SUFFIX) if path.is_file() else path
 
     def __enter__(self) -> Self:
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            # Without a buffer, nothing is lost when the process dies.
-            self._file = self._part.open("wb", buffering=0)
-        except OSError as error:
-            raise OSError(error.errno, f"{self._path}: cannot be written: {error.strerror}") from error
+        """Open the file.
+
+        Raises:
+            ValueError: another process writes it.
+            OSError: it cannot be written.
+        """
+        with ExitStack() as opened:
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                if self._part != self._path:
+                    self._claim(opened.enter_context(self._path.open("rb")))
+                # Without a buffer, nothing is lost when the process dies.
+                self._file: Any = opened.enter_context(self._part.open("ab", buffering=0))
+                if not is_stream(self._part):
+                    self._claim(self._file)
+                    self._file.truncate(0)
+            except OSError as error:
+                raise OSError(error.errno, f"{self._path}: cannot be written: {error.strerror}") from error
+            self._opened = opened.pop_all()
         return self
 
+    def _claim(self, file: BinaryIO) -> None:
+        """Refuse a file that another run writes: it would lose its estimates."""
+        with suppress(OSError):  # a file system without locks
+            if not try_lock(file):
+                raise ValueError(f"{self._path}: another run is writing it; wait for its end, or name another file")
+
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
-        self._file.close()
+        self._opened.close()
         if kind is not None and not self._lines:
             self.remove()
         elif kind is None and self._part != self._path:
