@@ -80,7 +80,9 @@ def write_failures(dataset: Path, out: Path, hard: Callable[[PairRecord], bool] 
 
 
 def mined_of(dataset: Path, folder: Path, **choices: Any) -> MinedRecipe:
-    return mine_recipe(dataset, Path("harder.toml"), MiningChoices(**choices), write_failures(dataset, folder / "poses.jsonl"))
+    return mine_recipe(
+        dataset, Path("harder.toml"), MiningChoices(**choices), write_failures(dataset, folder / "poses.jsonl")
+    )
 
 
 def test_shares_are_what_the_objective_says(dataset: Path, tmp_path: Path) -> None:

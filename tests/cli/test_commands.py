@@ -16,8 +16,10 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.calibration.calibration_files import write_calibration
+from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from nav.runner import method_names
@@ -182,3 +184,30 @@ def test_the_slow_variant_is_announced_and_no_other_one_continues_its_dataset(
     assert run([*command[3:], "--out", str(tmp_path / "out"), "--workers", "1"]) == WRONG_INPUT
     told = capsys.readouterr().err
     assert re.search(r"its frames were made by mitsuba .* scalar_rgb, .* but this is mitsuba .* llvm_ad_rgb, ", told)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["detect", "EMPTY", "--detector", "color-blob", "--out", "OUT"],
+        ["navigate", "EMPTY", "--method", "constant", "--out", "OUT"],
+        ["diff", "EMPTY", "WHOLE"],
+        ["diff", "WHOLE", "EMPTY"],
+        ["preview", "EMPTY", "--out", "OUT.png"],
+        ["browse", "EMPTY", "--out", "OUT"],
+        ["export", "EMPTY", "--format", "coco", "--out", "OUT"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_a_dataset_without_pairs_is_one_line(
+    arguments: list[str], dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty, recipe = tmp_path / "empty", parse_recipe(SMALL_RECIPE)
+    empty.mkdir()
+    write_manifest(empty, build_manifest(empty, recipe, "1", {}))
+    write_calibration(empty, recipe.rig)
+    places = {"EMPTY": empty, "WHOLE": dataset, "OUT": tmp_path / "out", "OUT.png": tmp_path / "out.png"}
+    assert run([str(places.get(word, word)) for word in arguments]) == WRONG_INPUT
+    line = capsys.readouterr().err.splitlines()[-1]  # behind progress
+    assert re.search(rf"{empty}: .*no pairs", line)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset", "empty"]

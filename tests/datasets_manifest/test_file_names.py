@@ -23,7 +23,9 @@ def before(tmp_path: Path) -> Path:
     folder = tmp_path / "before"
     (folder / "parts").mkdir(parents=True)
     (folder / "own.toml").write_text(DROGUE)
-    (folder / "parts" / "rig.toml").write_text('preset = "rgb-ideal"\nwidth_px = 160\nheight_px = 120\nfocal_px = 266.0\n')
+    (folder / "parts" / "rig.toml").write_text(
+        'preset = "rgb-ideal"\nwidth_px = 160\nheight_px = 120\nfocal_px = 266.0\n'
+    )
     shutil.copy(SKY, folder / "sky.hdr")
     return folder
 
