@@ -138,8 +138,8 @@ class DrawnBoxes:
         width_px, height_px = size_px
         if not (-0.5 - width < x < width_px - 0.5 and -0.5 - height < y < height_px - 0.5):
             raise ValueError(
-                f"{self.path}: {drawn.image_name}: the box {x + 0.5:g}, {y + 0.5:g}, {width:g}, {height:g} lies outside "
-                f"its image of {_size(size_px)} px"
+                f"{self.path}: {drawn.image_name}: the box {x + 0.5:g}, {y + 0.5:g}, {width:g}, {height:g} lies "
+                f"outside its image of {_size(size_px)} px"
             )
 
 

@@ -19,7 +19,7 @@ def move_file_names(table: MutableMapping[str, Any], before: Path, after: Path) 
 
     def move(names: MutableMapping[str, Any], key: str) -> None:
         name = names.get(key)
-        if isinstance(name, str) and not os.path.isabs(name):
+        if isinstance(name, str) and not Path(name).is_absolute():
             names[key] = Path(os.path.relpath(before.resolve() / name, after.resolve())).as_posix()
 
     def move_drogue_or_rig(names: MutableMapping[str, Any], key: str) -> None:
