@@ -216,6 +216,13 @@ class Recipe(FrozenModel):
         targets = [family.target for family in self.families] or [self.target]
         return tuple(variant for target in targets for variant in target.variants)
 
+    @property
+    def drogues(self) -> tuple[DrogueParameters, ...]:
+        """The different drogues of frames: of each family its variants, or the recipe's own where it has none."""
+        targets = [family.target for family in self.families] or [self.target]
+        shown = (each for target in targets for each in ([v.drogue for v in target.variants] or [self.drogue]))
+        return tuple(dict.fromkeys(shown))
+
     @model_validator(mode="after")
     def _families_differ(self) -> Self:
         names = [family.name for family in self.families]
@@ -246,9 +253,7 @@ class Recipe(FrozenModel):
 
     @model_validator(mode="after")
     def _engine_draws_the_drogues(self) -> Self:
-        targets = [family.target for family in self.families] or [self.target]
-        drogues = [drogue for each in targets for drogue in ([v.drogue for v in each.variants] or [self.drogue])]
-        bodies = sorted({drogue.name for drogue in drogues if drogue.body is not None})
+        bodies = sorted({drogue.name for drogue in self.drogues if drogue.body is not None})
         if bodies and self.render.engine == "analytic" and self.board is None:
             raise ValueError(
                 f"render.engine: analytic draws flat rings only, not {', '.join(bodies)}; use mitsuba or blender"
@@ -339,11 +344,10 @@ class Recipe(FrozenModel):
                     f"distance: {nearest:g} m is nearer than {limit:.2f} m, where both views hold the board"
                 )
             return self
-        drogues = [variant.drogue for variant in self.variants] or [self.drogue]
         if self.sequence is not None:
-            self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in drogues))
+            self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in self.drogues))
             return self
-        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in drogues)
+        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in self.drogues)
         if nearest < limit:
             raise ValueError(
                 f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue fits both views"

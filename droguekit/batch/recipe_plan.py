@@ -263,7 +263,7 @@ def check_sizes(drawn: DrawnFrames, recipe: Recipe) -> tuple[LawCheck, Array] | 
     shows, law = np.isfinite(drawn.distances_m), recipe.distance
     if law.law == "stations" or recipe.sequence is not None or not shows.any() or law.low_m == law.high_m:
         return None
-    if len({variant.drogue.rim_radius_m for variant in recipe.variants}) > 1:
+    if len({drogue.rim_radius_m for drogue in recipe.drogues}) > 1:
         return None
     assert law.low_m is not None and law.high_m is not None
     sides_px = drawn.sides_px[shows]

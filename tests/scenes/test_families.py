@@ -6,8 +6,9 @@ from collections import Counter
 
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe, recipe_names
 from droguekit.batch.recipe_plan import plan_recipe
+from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_frame, scenes_per_family, split_of_scenes
 from tests.support.recipe_builder import RecipeTable, Section, build_recipe, stations
 
@@ -86,3 +87,29 @@ def test_the_paper_count_ships() -> None:
     assert world.frames.scenes == 89 and 2 * world.frames.count == 14_298
     assert scenes_per_family(world) == [round(family.weight) for family in world.families]
     assert len(world.families) >= 12
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_recipe_knows_all_drogues_that_its_scenes_show(name: str) -> None:
+    source = load_recipe(name).recipe
+    assert len(set(source.drogues)) == len(source.drogues)
+    scenes = min(source.frames.scenes, 300)
+    shown = {drogue_of_scene(recipe_of_scene(source, scene), scene) for scene in range(scenes)}
+    assert shown <= set(source.drogues)
+    if scenes >= 8 * len(source.drogues):
+        # Each stands in so many scenes that chance alone hides few.
+        assert len(shown) > len(source.drogues) / 2
+
+
+def test_a_family_without_variants_shows_the_recipes_own_drogue() -> None:
+    small = {"drogue": "basket-small-orange"}
+    mixed = recipe(DAY, SEA | {"target": {"variants": [small, small]}})
+    assert [drogue.name for drogue in mixed.drogues] == ["red-8", "basket-small-orange"]
+    alone = recipe(DAY | {"target": {"variants": [small]}})
+    assert [drogue.name for drogue in alone.drogues] == ["basket-small-orange"]
+    # The nearest distance is that of the largest drogue, not of the variants alone.
+    nearest_m = alone.rig.nearest_full_view_m(alone.drogues[0].rim_radius_m)
+    at_it = {**BASE, "distance": stations(nearest_m + 0.01)}
+    assert build_recipe(at_it, families=[DAY | {"target": {"variants": [small]}}])
+    with pytest.raises(ValueError, match="where the whole drogue fits both views"):
+        build_recipe(at_it, families=[DAY, SEA | {"target": {"variants": [small]}}])

@@ -15,7 +15,6 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
-from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.coco import (
     HUB,
@@ -113,7 +112,7 @@ def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bo
 
     if not _one_flip_fits(source.manifest, in_image_order):
         log.lost("values of flip_idx that do not fit all drogues: train with fliplr=0")
-    ring = max(len(drogue.marker_positions_m) for drogue in _drogues(source.manifest))
+    ring = max(len(drogue.marker_positions_m) for drogue in source.manifest.recipe.drogues)
     flip = [-index % ring if index < ring else index for index in range(count)]
     return _write(source, out, log, rows, (f"kpt_shape: [{count}, 3]", f"flip_idx: {flip}"))
 
@@ -157,14 +156,9 @@ def _split_lines(splits: set[str], log: ExportLog) -> list[str]:
     return lines
 
 
-def _drogues(manifest: Manifest) -> list[DrogueParameters]:
-    recipe = manifest.recipe
-    return [variant.drogue for variant in recipe.variants] or [recipe.drogue]
-
-
 def _one_flip_fits(manifest: Manifest, in_image_order: bool) -> bool:
     """Whether one `flip_idx` is right for all drogues of a dataset."""
-    layouts = [marker_layout(drogue) for drogue in _drogues(manifest)]
+    layouts = [marker_layout(drogue) for drogue in manifest.recipe.drogues]
     even = all(layout.symmetry_order == layout.count for layout in layouts)
     return len({layout.count for layout in layouts}) == 1 and (even or in_image_order)
 

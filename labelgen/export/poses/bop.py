@@ -276,25 +276,15 @@ def _box(mask: Mask) -> list[int]:
     return [column, row, width - 1, height - 1]
 
 
-def dataset_drogues(recipe: Recipe) -> list[DrogueParameters]:
-    """The drogues of a dataset in the order of their object ids, which begin at 1."""
-    drogues: list[DrogueParameters] = []
-    for drogue in [variant.drogue for variant in recipe.variants] or [recipe.drogue]:
-        if drogue not in drogues:
-            drogues.append(drogue)
-    return drogues
-
-
 def object_id(recipe: Recipe, record: PairRecord) -> int:
-    """The object id of a pair's drogue.
+    """The object id of a pair's drogue: its place among the recipe's, from 1.
 
     Raises:
         ValueError: the pair has none, or one that is not in the recipe.
     """
-    drogues = dataset_drogues(recipe)
-    if record.frame.drogue not in drogues:
+    if record.frame.drogue not in recipe.drogues:
         raise ValueError(f"frame {record.frame_index}: drogue: is not in the recipe")
-    return drogues.index(record.frame.drogue) + 1
+    return recipe.drogues.index(record.frame.drogue) + 1
 
 
 def write_models(recipe: Recipe, folder: Path) -> None:
@@ -306,7 +296,7 @@ def write_models(recipe: Recipe, folder: Path) -> None:
     info = {}
     for name in ("models", "models_eval"):
         (folder / name).mkdir()
-    for number, drogue in enumerate(dataset_drogues(recipe), start=1):
+    for number, drogue in enumerate(recipe.drogues, start=1):
         mesh = trimesh.util.concatenate(list(drogue_meshes(drogue).values()))
         mesh.apply_scale(MM_PER_M)
         ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
