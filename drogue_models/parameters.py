@@ -198,6 +198,8 @@ class DrogueParameters(FrozenModel):
             for other, (x2, y2) in enumerate(self.marker_positions_m[:index]):
                 if math.hypot(x - x2, y - y2) <= 2 * (self.marker_radius_m + border_m):
                     raise ValueError(f"marker_positions_m: markers {other} and {index} overlap")
+        if self.marker_luminance_cd_m2 > 0 and max(self.marker_emission_rgb) == 0:
+            raise ValueError("marker_emission_rgb: markers that are lit need a colour above 0")
         self._check_code()
         if self.hub is not None and self.hub.outer_radius_m >= self.coupling_radius_m:
             raise ValueError(f"coupling_radius_m: must exceed the hub's outer radius, {self.hub.outer_radius_m} m")

@@ -27,7 +27,7 @@ from labelgen.disc_images import DiscInEye, hub_discs, marker_discs, window_arou
 from labelgen.part_pixels import drogue_box, drogue_mask, is_truncated, mask_box
 from render.camera.sensor import mono_weights
 from render.engine import EyeRadiance, StereoRadiance
-from scenes.sky.photometry import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE, infrared_light
 
 # A feature's background reaches from its edge to this multiple of its radius.
 _SURROUNDINGS_REACH = 1.8
@@ -262,8 +262,10 @@ def signal_to_noise(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance) -> flo
 def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
     """(..., C) mean electrons of the sensor's channels, at most a full well."""
     light = radiance_cd_m2.astype(np.float64)
-    if frame.is_monochrome:
-        light = light @ mono_weights(frame.sensor).T
+    if frame.band_nm is not None:
+        light = infrared_light(light, frame.band_nm)[..., None]
+    elif frame.is_monochrome:
+        light = light @ mono_weights(None).T
     electrons: Array = np.clip(light * frame.sensor.electrons_per_cd_m2(frame.exposure), 0.0, frame.sensor.full_well_e)
     return electrons
 

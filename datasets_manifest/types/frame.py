@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
-from datasets_manifest.types.video_camera import VideoCamera
+from datasets_manifest.types.video_camera import CAMERA_BAND_NM, VideoCamera
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import MAX_NEIGHBOURS
@@ -213,6 +213,12 @@ class FrameSpec(FrozenModel):
     def is_monochrome(self) -> bool:
         """Whether the sensor measures one band."""
         return self.sensor.color == "mono" or (self.camera is not None and self.camera.spectrum != "colour")
+
+    @property
+    def band_nm(self) -> float | None:
+        """Middle of the band that a near-infrared camera or sensor measures; None for visible light. [nm]"""
+        is_infrared = self.camera is not None and self.camera.spectrum == "near-infrared"
+        return CAMERA_BAND_NM if is_infrared else self.sensor.band_nm
 
     def sought_and_neighbours(self) -> tuple[FrameSpec, ...]:
         """The frame as it is, then once for each neighbour with that as its drogue and no others."""

@@ -277,7 +277,7 @@ def _marker_light(recipe: Recipe, scene: _Scene, scale_px_per_m: float) -> tuple
     drawn = spread_discs(_PHASES, size, np.full(len(_PHASES), sensor.psf_sigma_px), half, 1)
     on_face = _share_of_face(recipe, scale_px_per_m, half, sensor.psf_sigma_px)
     electrons = sensor.electrons_per_cd_m2(scene.exposure)
-    colors = mono_weights(sensor) if sensor.color == "mono" else np.eye(3)
+    colors = mono_weights(sensor.band_nm) if sensor.color == "mono" else np.eye(3)
     # A mosaic measures one colour a pixel: a quarter, a half and a quarter of the pixels.
     shares = np.array([0.25, 0.5, 0.25]) if sensor.color == "bayer" else np.ones(len(colors))
     step_e = 2.0 ** (sensor.adc_bits - sensor.output_bits) / dn_per_electron(sensor, scene.exposure.gain)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import bulk_frame_generator
 from datasets_manifest.types.frame import FrameSpec, Sensor
 from datasets_manifest.types.images import Pixels, StereoImages, srgb_from_light
-from datasets_manifest.types.video_camera import CAMERA_BAND_NM, ImageProcessing
+from datasets_manifest.types.video_camera import ImageProcessing
 from geometry.stereo import EYES, Eye
 from render.camera.image_coding import deliver
 from render.camera.image_processing import develop, metered
@@ -103,9 +103,7 @@ def _sample_sites(seen: NDArray[np.float32], frame: FrameSpec) -> NDArray[np.flo
     """Light on each site of the sensor: (H, W, 3), or (H, W) for a mosaic or a monochrome sensor."""
     camera, color = frame.camera, frame.sensor.color
     if frame.is_monochrome:
-        if camera is not None and camera.spectrum == "near-infrared":
-            return infrared_light(seen, CAMERA_BAND_NM)
-        return monochrome_light(seen, frame.sensor)
+        return monochrome_light(seen, frame.band_nm)
     if color == "rgb" and (camera is None or camera.processing is None):
         return seen
     mosaic = np.empty(seen.shape[:2], dtype=np.float32)
@@ -114,17 +112,17 @@ def _sample_sites(seen: NDArray[np.float32], frame: FrameSpec) -> NDArray[np.flo
     return mosaic
 
 
-def monochrome_light(light: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float32]:
-    """(H, W) light that a monochrome sensor collects of (H, W, 3) light. [cd/m2]"""
-    if sensor.band_nm is not None:
-        return infrared_light(light, sensor.band_nm)
+def monochrome_light(light: NDArray[np.float32], band_nm: float | None) -> NDArray[np.float32]:
+    """(H, W) light that a monochrome sensor collects of (H, W, 3) light; `band_nm` as of frames. [cd/m2]"""
+    if band_nm is not None:
+        return infrared_light(light, band_nm)
     mono: NDArray[np.float32] = cv2.transform(light, MONO_WEIGHTS)
     return mono
 
 
-def mono_weights(sensor: Sensor) -> NDArray[np.float64]:
+def mono_weights(band_nm: float | None) -> NDArray[np.float64]:
     """(1, 3) weights of the three bands in a monochrome sensor, without what plants have beyond red."""
-    return MONO_WEIGHTS.astype(np.float64) if sensor.band_nm is None else infrared_weights(sensor.band_nm)[None]
+    return MONO_WEIGHTS.astype(np.float64) if band_nm is None else infrared_weights(band_nm)[None]
 
 
 @lru_cache(maxsize=2)

@@ -78,7 +78,7 @@ class SensorNoise:
             reach = int(np.ceil(4 * sensor.psf_sigma_px))
             # The root of the kernel's energy, once for the rows and once for the columns.
             left_by_lens = float(np.sum(cv2.getGaussianKernel(2 * reach + 1, sensor.psf_sigma_px) ** 2))
-        weights = mono_weights(sensor).T if sensor.color == "mono" else np.eye(3)
+        weights = mono_weights(frame.band_nm).T if frame.is_monochrome else np.eye(3)
         return cls(
             weights=weights,
             per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),

@@ -79,6 +79,10 @@ def test_long_form_of_the_positions(tmp_path: Path) -> None:
         (RING + "[hub]\ndepth_m = 0.01\n", "hub.depth_m: must exceed the rim's thickness, 0.012 m"),
         (RING + "[hub]\ninner_radius_m = 0.08\n", "hub: inner_radius_m: must be below outer_radius_m"),
         (RING + "[hub]\ncolour = 1\n", "hub.colour: Extra inputs are not permitted"),
+        (
+            RING + "marker_luminance_cd_m2 = 100.0\nmarker_emission_rgb = [0, 0, 0]\n",
+            "marker_emission_rgb: markers that are lit need a colour above 0",
+        ),
         (RING + "body_mesh = 3\n", "body_mesh: must be the path of a mesh file, got 3"),
         (RING + 'body_mesh = "none.ply"\n', "body_mesh: .*none.ply cannot be read: No such file or directory"),
         ("name = \n", "not valid TOML"),

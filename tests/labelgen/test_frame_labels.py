@@ -1,18 +1,23 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import ViewRecord
+from datasets_manifest.types.video_camera import Spectrum, VideoCamera
 from drogue_models.marker_layout import marker_layout
 from drogue_models.meshes import drogue_meshes
-from drogue_models.parts import drogue_part_ids
+from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.frame_labels import label_frame
+from labelgen.disc_images import marker_discs
+from labelgen.frame_labels import label_frame, signal_to_noise
 from labelgen.part_pixels import drogue_box, drogue_hull_m, mask_box
+from render.camera.sensor import dn_per_electron, expose
 from render.engine import EyeRadiance
 from tests.support.drawn_pairs import Pair
 
@@ -184,6 +189,34 @@ def test_signal_to_noise_follows_shot_and_read_noise(full_pairs: list[Pair]) -> 
     for marker in pair.record.views.left.markers:
         # The drawn radiance is even over every part, so that only float32 rounds.
         assert marker.signal_to_noise == pytest.approx(want, rel=1e-5)
+
+
+@pytest.mark.parametrize("spectrum", ["grey", "near-infrared"])
+def test_signal_to_noise_is_that_of_the_cameras_band(full_pairs: list[Pair], spectrum: Spectrum) -> None:
+    pair = full_pairs[-1]
+    exact = pair.frame.sensor.model_copy(update={"noise_free": True, "output_bits": 8, "encoding": "linear"})
+    frame = pair.frame.model_copy(update={"camera": VideoCamera(spectrum=spectrum), "sensor": exact})
+    red, grey = np.float32([6000.0, 400.0, 300.0]), np.float32([150.0, 150.0, 150.0])
+
+    def painted(seen: EyeRadiance, is_red: np.ndarray) -> EyeRadiance:
+        return replace(seen, radiance_cd_m2=np.where(is_red[..., None], red, grey))
+
+    def electrons(is_red: bool) -> float:
+        """Of a picture that is even all over, which no lens changes."""
+        eyes = [
+            painted(seen, np.full(seen.part_id.shape, is_red)) for seen in (pair.radiance.left, pair.radiance.right)
+        ]
+        level = np.float64(expose(frame, replace(pair.radiance, left=eyes[0], right=eyes[1])).left)[20:-20, 20:-20]
+        stored = level.mean() / 255 * (2**exact.adc_bits - 1) - exact.black_level_dn
+        return float(stored / dn_per_electron(exact, frame.exposure.gain))
+
+    signal_e, around_e = electrons(True), electrons(False)
+    want = (signal_e - around_e) / np.sqrt((signal_e + around_e) / 2 + exact.read_noise_e**2)
+    seen = painted(pair.radiance.left, pair.radiance.left.part_id >= FIRST_MARKER_ID)
+    assert frame.drogue is not None and frame.left_from_drogue is not None
+    for disc in marker_discs(marker_layout(frame.drogue), frame.rig, frame.left_from_drogue, "left"):
+        # The picture has 8 bits; in the wrong band the contrast is off by a factor of two and more.
+        assert signal_to_noise(frame, disc, seen) == pytest.approx(want, rel=0.03)
 
 
 def test_other_images_are_refused(full_pairs: list[Pair]) -> None:
