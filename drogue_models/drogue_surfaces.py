@@ -122,7 +122,7 @@ def _striped(body: DrogueBody, grid: MapGrid, paint: Paint) -> Paint:
 def _cloth(grid: MapGrid, paint: Paint, wear: SurfaceWear, seed: int, seams_m: Array) -> Paint:
     """Gores of unlike tint, hems, and seams with their thread."""
     weave = fractal_noise(grid, seed, (0.006, 0.15), octaves=2)
-    tints = panel_tints(grid, seed + 1, seams_m[1:], [], 0.05 * wear.fading)
+    tints = panel_tints(grid, seed + 1, seams_m, [], 0.05 * wear.fading)
     paint = shaded(paint, np.maximum(tints * (1.0 + 0.03 * weave), 0.3))
     height_m = grid.height_m
     hems = bands(grid, [(0.0, 0.012), (height_m - 0.012, height_m)])
@@ -139,7 +139,7 @@ def _sheet(grid: MapGrid, paint: Paint, wear: SurfaceWear, seed: int, leaves: in
     """Rolled metal: leaves of unlike tint, rivets at their roots, scuffs at their tips."""
     edges_m = np.arange(leaves) * grid.width_m / leaves
     grain = fractal_noise(grid, seed, (0.003, 0.25), octaves=2)
-    tints = panel_tints(grid, seed + 1, edges_m[1:], [], 0.04 + 0.06 * wear.fading)
+    tints = panel_tints(grid, seed + 1, edges_m, [], 0.04 + 0.06 * wear.fading)
     paint = shaded(paint, np.maximum(tints * (1.0 + 0.04 * grain), 0.3))
     rivets = rivet_rows(grid, edges_m + 0.25 * grid.width_m / leaves, 0.02, 0.002)
     rivets *= (grid.y_m > 0.8 * grid.height_m)[:, None]

@@ -37,6 +37,8 @@ from geometry.se3 import Array
 # Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
 _SMALLEST_BODY_M, _LARGEST_BODY_M = 0.05, 10.0
 _ARCHIVES = {"bz2", "gz", "tar.bz2", "tar.gz", "zip", "3mf", "3dxml", "zae"}
+# Cosine of a hose's direction with the x axis beyond which its rings begin at the y axis.
+_STEEP = 0.9
 # float32 files round a front at z = 0 by this much for bodies of a few metres.
 _FRONT_TOLERANCE_M = 1e-6
 
@@ -149,7 +151,8 @@ def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
 def _carried_frame(tangents: Array) -> tuple[Array, Array]:
     """Two (S, 3) unit vectors across the curve with minimal rotation along it, `side x up = tangent`."""
     side = np.empty_like(tangents)
-    seed = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    # The same axis for hoses that differ little: their vertices and the flow of images follow them.
+    seed = np.eye(3)[1 if abs(tangents[0, 0]) > _STEEP else 0]
     for index, tangent in enumerate(tangents):
         across = seed - (seed @ tangent) * tangent
         seed = side[index] = across / np.linalg.norm(across)

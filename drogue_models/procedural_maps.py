@@ -74,12 +74,6 @@ def shaded(paint: NDArray[np.float64], factor: Layer) -> NDArray[np.float64]:
     return paint * factor[..., None]
 
 
-def with_mean(paint: NDArray[np.float64], rgb: ArrayLike) -> NDArray[np.float64]:
-    """Paint scaled by band to a mean reflectance."""
-    result: NDArray[np.float64] = paint * (np.asarray(rgb) / np.maximum(paint.mean(axis=(0, 1)), 1e-9))
-    return result
-
-
 def finished(paint: NDArray[np.float64]) -> NDArray[np.float32]:
     """The map for `PaintedMesh`, within what real surfaces reflect."""
     limited: NDArray[np.float32] = np.clip(paint, LOWEST_REFLECTANCE, HIGHEST_REFLECTANCE).astype(np.float32)
@@ -265,7 +259,7 @@ def panel_tints(grid: MapGrid, seed: int, u_limits_m: ArrayLike, v_limits_m: Arr
     Args:
         grid: of the map.
         seed: of the tints.
-        u_limits_m, v_limits_m: where panels meet, ascending. [m]
+        u_limits_m, v_limits_m: where panels meet, ascending; on a map that wraps, u limits as many as panels. [m]
         spread: standard deviation between panels.
     """
     column = np.searchsorted(np.asarray(u_limits_m, dtype=np.float64), grid.x_m)

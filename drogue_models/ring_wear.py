@@ -156,7 +156,7 @@ def _canopy(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wea
     seams_m = np.arange(gores) * grid.width_m / gores
     paint = aged_paint(grid, rgb, wear, seed)
     weave = fractal_noise(grid, seed + 10, (0.006, 0.15), octaves=2)
-    paint = shaded(paint, panel_tints(grid, seed + 11, seams_m[1:], [], 0.05 * wear.fading) * (1.0 + 0.03 * weave))
+    paint = shaded(paint, panel_tints(grid, seed + 11, seams_m, [], 0.05 * wear.fading) * (1.0 + 0.03 * weave))
     hems = bands(grid, [(0.0, 0.012), (length_m - 0.012, length_m)])
     paint = shaded(paint, 1.0 - 0.25 * wear.stitching * np.maximum(hems, lines(grid, seams_m, 0.010)))
     thread = np.maximum(
@@ -176,7 +176,7 @@ def _ribs(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear:
     pitch_m = grid.width_m / drogue.rib_count
     paint = aged_paint(grid, rgb, wear, seed)
     paint = shaded(
-        paint, panel_tints(grid, seed + 10, np.arange(1, drogue.rib_count) * pitch_m, [], 0.02 + 0.08 * wear.fading)
+        paint, panel_tints(grid, seed + 10, np.arange(drogue.rib_count) * pitch_m, [], 0.02 + 0.08 * wear.fading)
     )
     rng = np.random.default_rng([seed, 50])
     taped = np.zeros((grid.rows, grid.columns))

@@ -238,4 +238,3 @@ def _identity_and_cross(vector: Array, first: float, second: float) -> Array:
 
 FRD_FROM_OPTICAL = RigidTransform(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
 FLU_FROM_FRD = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
-NED_FROM_ENU = RigidTransform(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))

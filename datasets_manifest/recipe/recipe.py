@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 from drogue_models.untrusted_files import parse_toml, read_text
+from geometry.stereo import VIEW_MARGIN_PX
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
@@ -282,6 +284,15 @@ class Recipe(FrozenModel):
                 'camera: gives pictures of 8 bits for screens; set rig.encoding to "gamma" and rig.output_bits to 8, '
                 f"got {self.sensor.encoding} and {self.sensor.output_bits}"
             )
+        if self.sensor.color == "bayer" and any(
+            part.camera.grey_scene_fraction + part.camera.near_infrared_scene_fraction > 0
+            for part in parts
+            if part.camera is not None
+        ):
+            raise ValueError(
+                "camera: grey and near-infrared cameras have no mosaic, which the rig delivers; set "
+                "camera.grey_scene_fraction and camera.near_infrared_scene_fraction to 0, or take another rig"
+            )
         return self
 
     @model_validator(mode="after")
@@ -347,10 +358,12 @@ class Recipe(FrozenModel):
         if self.sequence is not None:
             self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in self.drogues))
             return self
-        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in self.drogues)
+        margin_px = VIEW_MARGIN_PX + self.rig.largest_shift_px()
+        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m, margin_px) for drogue in self.drogues)
         if nearest < limit:
             raise ValueError(
-                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue fits both views"
+                f"distance: {nearest:g} m is nearer than {math.ceil(100 * limit) / 100:.2f} m, where the whole drogue "
+                "fits both views"
             )
         return self
 

@@ -276,6 +276,10 @@ def run_time_s(length_m: float, speed_m_s: float) -> float:
     return length_m / peak_m_s + peak_m_s / CLOSURE_ACCELERATION_M_S2
 
 
+MOST_SEQUENCE_S = 7200.0
+"""The longest sequence: the motion up to its last frame is computed at once, at some 200 s of it a second. [s]"""
+
+
 class SequenceRanges(FrozenModel):
     """Distribution of the sequences of a recipe; each has a scene, a hose motion and turbulence of its own.
 
@@ -321,6 +325,11 @@ class SequenceRanges(FrozenModel):
                 "use 'none'"
             )
         span_s = (self.frames_per_sequence - 1) / self.frame_rate_hz
+        if span_s > MOST_SEQUENCE_S:
+            raise ValueError(
+                f"frame_rate_hz: {self.frames_per_sequence} frames at {self.frame_rate_hz:g} Hz last {span_s:.4g} s, "
+                f"at most {MOST_SEQUENCE_S:g} s can be flown; raise frame_rate_hz, or lower frames_per_sequence"
+            )
         for manoeuvre in self.receiver.manoeuvres:
             needed_s = self.receiver.duration_s(manoeuvre)
             if span_s < needed_s:

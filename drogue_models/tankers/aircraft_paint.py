@@ -171,7 +171,7 @@ class _Sheet:
             where = (field > 0.12) & (above | scheme.wraps)
             color[where] = scheme.blotches
         if scheme.accent is not None:
-            self._accents(color, x, y)
+            self._accents(color)
         if scheme.weave:
             row, column = np.indices(self.size)
             color *= (1.0 + 0.10 * (((row // 2 + column // 2) % 2) - 0.5))[..., None].astype(np.float32)
@@ -183,7 +183,7 @@ class _Sheet:
             return self.airframe.belt_z_m - 0.45
         return float(np.quantile(self.place_m[..., 2], 0.30))
 
-    def _accents(self, color: Texels, x: Texels, y: Texels) -> None:
+    def _accents(self, color: Texels) -> None:
         """Bright bands where trainers and unmanned aircraft have them."""
         accent = self.scheme.accent
         assert accent is not None

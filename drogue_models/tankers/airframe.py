@@ -78,8 +78,7 @@ class Airframe:
         trails: soot and oil.
         roundels: markings.
         panel_m: mean size of skin panels.
-        deck_m: half width around the middle in which the fuselage's windscreen lies, and its x range and lowest z; or
-            None.
+        deck_m: x range of the fuselage's windscreen, and its lowest z; or None.
         belt_z_m: height of windows and cheat line on the fuselage.
         belly_line_m: x range of a line along the belly, or None.
         pod_lights: whether a collar with lamps surrounds the hose's exit.

@@ -58,7 +58,7 @@ PROPELLERS: dict[TankerType, Propellers] = {
 
 
 class Tanker(FrozenModel):
-    """One tanker; every field is the same for all frames of a scene but `blade_sweep_deg`.
+    """One tanker; every field is the same for all frames of a scene but those of the blades.
 
     Tanker frame: x aft, y along the right wing, z up, origin where the hose leaves, whatever the station.
 

@@ -78,7 +78,7 @@ def metered(processing: ImageProcessing, frame: FrameSpec, raw: Sequence[NDArray
         gains = np.clip(toward_grey, 1.0 / _MOST_GAIN, _MOST_GAIN) * processing.white_balance
         changes["white_balance"] = (float(gains[0]), float(gains[1]))
     limit, factor = processing.brightest_mean_fraction, processing.exposure_factor
-    if factor * mean / (1.0 + (factor - 1.0) * mean) > limit:
+    if limit < 1.0 and factor * mean / (1.0 + (factor - 1.0) * mean) > limit:
         # Below a twentieth nothing would be left of a picture that is white all over.
         changes["exposure_factor"] = max(limit * (1.0 - mean) / (mean * (1.0 - limit)), 0.06)
     return processing.model_copy(update=changes)

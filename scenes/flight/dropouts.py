@@ -233,7 +233,12 @@ def sun_beside_drogue_deg(
 
 def formation_displacement_m(event: DropoutEvent, speed_m_s: float, time_s: float) -> Array:
     """(2,) east and north of a turning formation from its position at the start of the sequence. [m]"""
-    middles = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * time_s
-    headings = np.array([event.heading_rad(float(middle)) for middle in middles])
-    displacement: Array = speed_m_s * time_s * np.array([np.cos(headings).mean(), np.sin(headings).mean()])
+    begin_s, end_s, onset_s = event.begin_s, event.end_s, event.onset_s
+    changes_s = np.clip([0.0, begin_s - onset_s, begin_s, end_s, end_s + onset_s, time_s], 0.0, time_s)
+    displacement = np.zeros(2)
+    # The heading changes in the onset and in the end alone.
+    for low_s, high_s, samples in zip(changes_s, changes_s[1:], (1, _SAMPLES, 1, _SAMPLES, 1), strict=False):
+        middles_s = low_s + (np.arange(samples) + 0.5) / samples * (high_s - low_s)
+        headings = np.array([event.heading_rad(float(middle_s)) for middle_s in middles_s])
+        displacement += speed_m_s * (high_s - low_s) * np.array([np.cos(headings).mean(), np.sin(headings).mean()])
     return displacement

@@ -223,6 +223,15 @@ def test_hose_is_a_closed_tube_of_fixed_layout() -> None:
         assert hose.vertices.shape == hoses[0].vertices.shape
 
 
+@pytest.mark.parametrize("side", [[0.3, 0.3], [0.3, -0.3], [-0.2, 0.0], [0.0, 0.0]])
+def test_a_hose_that_moves_a_little_carries_its_vertices_along(side: list[float]) -> None:
+    nodes = np.linspace([0.0, 0.0, 0.45], [*side, 5.0], 6)
+    moved = nodes + np.linspace(0.0, 1.0, 6)[:, None] * np.random.default_rng(2).normal(scale=1e-4, size=(6, 3))
+    shift_m = np.linalg.norm(hose_mesh(moved, 0.03).vertices - hose_mesh(nodes, 0.03).vertices, axis=1).max()
+    # The spline overshoots its nodes a little, and the turn of a ring adds to its middle's way.
+    assert shift_m < 5 * np.linalg.norm(moved - nodes, axis=1).max()
+
+
 def test_straight_hose_has_the_volume_of_its_prism() -> None:
     hose = hose_mesh([[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]], 0.05)
     sections = 32

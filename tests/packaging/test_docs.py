@@ -16,6 +16,7 @@ import pytest
 import droguekit
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe, load_recipe
 from datasets_manifest.recipe.rigs import _RigTable
+from datasets_manifest.recipe.sequence_ranges import MOST_SEQUENCE_S
 from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import MAX_MARKERS
@@ -84,6 +85,7 @@ def test_limits_are_those_of_the_code() -> None:
         "scenes": frames["scenes"].metadata[1].le,
         "families": Recipe.model_fields["families"].metadata[0].max_length,
         "width or height of an image": table["width_px"].metadata[1].le,
+        "time from a sequence's first pair to its last": int(MOST_SEQUENCE_S),
         "markers of a drogue": MAX_MARKERS,
         "time for a frame (`--timeout`)": int(MOST_TIMEOUT_S),
     }

@@ -98,3 +98,12 @@ def test_families_have_cameras_of_their_own() -> None:
 def test_wrong_keys_are_named(rig: object, camera: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build_recipe(BASE, rig=rig, camera=camera)  # type: ignore[arg-type]
+
+
+def test_cameras_without_colour_take_no_rig_with_a_mosaic() -> None:
+    rig = {"preset": "paper-colour", "encoding": "gamma", "output_bits": 8}
+    for name in ("grey_scene_fraction", "near_infrared_scene_fraction"):
+        shares = {"grey_scene_fraction": 0.0, "near_infrared_scene_fraction": 0.0}
+        assert build_recipe(BASE, rig=rig, camera=shares).camera is not None
+        with pytest.raises(ValueError, match="grey and near-infrared cameras have no mosaic"):
+            build_recipe(BASE, rig=rig, camera=shares | {name: 0.1})

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -9,7 +10,6 @@ import pytest
 from datasets_manifest.random_streams import bulk_frame_generator, frame_generator, stream_seed
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
-from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
 from scenes.framing import distance_at, sample_distance_m
@@ -140,7 +140,7 @@ def test_on_axis_stays_on_the_rig_axis() -> None:
 
 
 def test_an_attitude_that_never_fits_is_one_clear_error() -> None:
-    drawn = recipe(distance=stations(1.47), pose={"pitch_deg": 0, "yaw_deg": [40, 45]})
+    drawn = recipe(distance=stations(1.48), pose={"pitch_deg": 0, "yaw_deg": [40, 45]})
     with pytest.raises(ValueError, match="no attitude within the recipe's ranges"):
         sample_frame(drawn, 0)
 
@@ -236,9 +236,15 @@ def test_hose_runs_from_the_coupling_to_the_pod() -> None:
     assert cosines.min() > 0.9  # no kinks
 
 
-def test_meter_lights_the_brighter_of_sky_and_plate() -> None:
-    drawn = recipe()
+@pytest.mark.parametrize("rig", ["rgb-ideal", "paper-real", "mono"])
+def test_the_nearest_distance_that_is_taken_can_be_drawn(rig: str) -> None:
+    facing = {"pitch_deg": [0, 0], "yaw_deg": [0, 0]}
+    drawn = build_recipe(BASE, rig=rig, pose=facing, distance=stations(5.0))
+    whole_m = drawn.rig.nearest_full_view_m(drawn.drogue.rim_radius_m)
+    with pytest.raises(ValueError, match="where the whole drogue fits both views") as caught:
+        build_recipe(BASE, rig=rig, pose=facing, distance=stations(whole_m + 1e-3))
+    told_m = float(re.search(r"nearer than ([\d.]+) m", str(caught.value))[1])
+    assert told_m < whole_m + 0.1
+    nearest = build_recipe(BASE, rig=rig, pose=facing, distance=stations(told_m))
     for index in range(10):
-        frame = sample_frame(drawn, index)
-        assert 20e-6 <= frame.exposure.time_s <= 20e-3
-    assert marker_layout(frame.drogue).count == 8
+        sample_frame(nearest, index)

@@ -64,7 +64,7 @@ def test_types_and_paints_come_in_the_shares_of_their_weights() -> None:
         (("unmanned", "buddy-store", "trainer"), 0.25),
     ):
         assert kinds[kind] / 2000 == pytest.approx(share, abs=0.035)
-    assert sum(kinds.values()) == sum(kinds[kind] for kind in kinds)
+    assert len(kinds) == 3
     assert np.mean([tanker.nav_lights for tanker in drawn]) == pytest.approx(0.25, abs=0.035)
     assert {tanker.pod_light for tanker in drawn} == {"red"}
     assert {tanker.flaps_deg for tanker in drawn} == {5.0, 10.0, 15.0}

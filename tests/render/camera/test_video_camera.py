@@ -23,7 +23,7 @@ from datasets_manifest.types.video_camera import (
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from render.camera.image_coding import draw_overlay, intra_coded, jpeg, one_field
-from render.camera.image_processing import noise_by_level, tone_tables
+from render.camera.image_processing import metered, noise_by_level, tone_tables
 from render.camera.optics import saturation_cd_m2
 from render.camera.sensor import expose
 from render.camera.video_lens import add_bloom, ghosts, see_through, shift_colors
@@ -322,6 +322,13 @@ def test_the_colour_of_a_view_is_taken_as_far_to_grey_as_asked(frame: FrameSpec)
         shown = expose(with_camera(frame, camera), light).left[20:-20, 20:-20].mean(axis=(0, 1)) / 255
         linear = light_from_srgb(shown)
         np.testing.assert_allclose(linear / linear[1], tint ** (1.0 - share), rtol=0.02)
+
+
+@pytest.mark.parametrize("exponent", np.linspace(-3.0, -1.0, 40).tolist())
+def test_a_picture_white_all_over_may_stay_so(frame: FrameSpec, exponent: float) -> None:
+    white = [np.full((8, 8), 2**frame.sensor.adc_bits - 1, np.uint16)] * 2
+    given = ImageProcessing(exposure_factor=2.0**exponent, brightest_mean_fraction=1.0)
+    assert metered(given, frame, white).exposure_factor == given.exposure_factor
 
 
 def test_infrared_darkens_the_sky_brightens_leaves_and_leaves_grey(frame: FrameSpec) -> None:

@@ -188,6 +188,14 @@ def test_a_formation_that_turns_flies_where_it_heads() -> None:
     np.testing.assert_allclose(moved, 120.0 * np.array([np.cos(heading), np.sin(heading)]), atol=0.05)
 
 
+@pytest.mark.parametrize("begin_s", [2.0, 300.0, 30_000.0])
+def test_a_formation_flies_as_fast_however_late_it_turns(begin_s: float) -> None:
+    happens = DropoutEvent("glare", begin_s, begin_s + 2.0, 1.0, 1, 1.0, 1.0, 0.5, 0.1, 0.25)
+    places = np.array([formation_displacement_m(happens, 130.0, begin_s - 2.0 + 0.04 * k) for k in range(200)])
+    # Chords of the turn are shorter than its arcs by (0.04 s * 0.4 rad/s)^2 / 24.
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 130.0 * 0.04, rtol=1e-4)
+
+
 def test_it_comes_lasts_and_goes_smoothly() -> None:
     happens = DropoutEvent("occlusion", 2.0, 4.0, 0.5, 1, 1.0, 1.0, 0.5, 0.1, 0.2)
     times = np.linspace(0, 6, 6001)

@@ -16,6 +16,10 @@ from tests.support.small_datasets import STATION_KEEPING
         ({"hose": "long"}, r"no hose named 'long'; there are full-size, small-uav"),
         ({"turbulence": "wild"}, r"sequence.turbulence"),
         ({"frame_rate_hz": 0}, r"sequence.frame_rate_hz"),
+        (
+            {"frame_rate_hz": 1e-3},
+            r"sequence: frame_rate_hz: \d+ frames at 0.001 Hz last [\d.e+]+ s, at most 7200 s can be flown",
+        ),
         ({"frame_rate_hz": 600}, r"exposure: up to 0.002 s are longer than the 0.00166667 s"),
         ({"receiver": {"offset_right_m": [0, 2]}}, r"station leaves the visible volume at 4 m"),
         ({"receiver": {"hold_s": -1}}, r"sequence.receiver.hold_s"),
