@@ -154,7 +154,7 @@ class _Sheet:
 
     def _base(self) -> Texels:
         scheme = self.scheme
-        x, y, z = (self.place_m[..., axis] for axis in range(3))
+        z = self.place_m[..., 2]
         above = np.broadcast_to(~self.lower, self.size) if self.is_wing and self.role != "fin" else z > self._side_z_m()
         if self.role == "fin":
             above = np.ones(self.size, dtype=bool)
