@@ -6,7 +6,6 @@ rig has lenses, and `real_px` and `ideal_px` convert between the two.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -19,8 +18,6 @@ from geometry.se3 import FRD_FROM_OPTICAL, Array, RigidTransform, read_only
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")
-VIEW_MARGIN_PX = 1.5
-"""From the image's edge to what counts as whole in view: for the lens blur, and for outlines sampled at points. [px]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +127,14 @@ class StereoRig:
         y_low, y_high = radius_m - up_reach, down_reach - radius_m
         return None if x_low > x_high or y_low > y_high else (x_low, x_high, y_low, y_high)
 
-    def nearest_full_view_m(self, radius_m: float, margin_px: float = 0.0) -> float:
-        """Depth of the nearest facing disc of this radius that both eyes see whole, so far from their edges. [m]"""
-        return self.nearest_plate_view_m(2 * radius_m, 2 * radius_m, margin_px)
+    def nearest_full_view_m(self, radius_m: float) -> float:
+        """Depth of the nearest facing disc of this radius that both eyes can see whole. [m]"""
+        return self.nearest_plate_view_m(2 * radius_m, 2 * radius_m)
 
-    def nearest_plate_view_m(self, width_m: float, height_m: float, margin_px: float = 0.0) -> float:
-        """Depth of the nearest facing plate, upright, of this size that both eyes see whole, so far from their edges.
-
-        Infinite where the margin leaves nothing of the image. [m]
-        """
+    def nearest_plate_view_m(self, width_m: float, height_m: float) -> float:
+        """Depth of the nearest facing plate, upright, of this size that both eyes can see whole. [m]"""
         c = self.camera
-        high_px, wide_px = c.height_px - 2 * margin_px, c.width_px - 2 * margin_px
-        if min(high_px, wide_px) <= 0:
-            return math.inf
-        return max(height_m * c.fy_px / high_px, (width_m + self.baseline_m) * c.fx_px / wide_px)
+        return max(height_m * c.fy_px / c.height_px, (width_m + self.baseline_m) * c.fx_px / c.width_px)
 
 
 def paper_rig() -> StereoRig:

@@ -8,12 +8,13 @@ from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
-from geometry.stereo import VIEW_MARGIN_PX, StereoRig
+from geometry.stereo import StereoRig
 from scenes.environment_sampling import sample_uniform
 
 _MOST_TRIES = 1000
 _OUTLINE_POINTS = 72
-# The rim polygon of 72 points lies within 0.1 % of the circle, which the view's margin covers.
+# The rim polygon of 72 points lies within 0.1 % of the circle; the margin covers that and the lens blur.
+_MARGIN_PX = 1.5
 
 
 def outline_points_m(drogue: DrogueParameters) -> Array:
@@ -45,7 +46,7 @@ def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[fl
     z = depth_m + points_m[:, 2]
     if z.min() <= 0:
         return None
-    margin_px = VIEW_MARGIN_PX + rig.largest_shift_px()
+    margin_px = _MARGIN_PX + rig.largest_shift_px()
     left = (margin_px - 0.5 - c.cx_px) / c.fx_px * z - points_m[:, 0]
     right = (c.width_px - 0.5 - margin_px - c.cx_px) / c.fx_px * z - points_m[:, 0]
     up = (margin_px - 0.5 - c.cy_px) / c.fy_px * z - points_m[:, 1]

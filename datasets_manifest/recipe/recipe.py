@@ -27,7 +27,6 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 from drogue_models.untrusted_files import parse_toml, read_text
-from geometry.stereo import VIEW_MARGIN_PX
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
@@ -358,8 +357,7 @@ class Recipe(FrozenModel):
         if self.sequence is not None:
             self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in self.drogues))
             return self
-        margin_px = VIEW_MARGIN_PX + self.rig.largest_shift_px()
-        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m, margin_px) for drogue in self.drogues)
+        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in self.drogues)
         if nearest < limit:
             raise ValueError(
                 f"distance: {nearest:g} m is nearer than {math.ceil(100 * limit) / 100:.2f} m, where the whole drogue "

@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 import pytest
 
-from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, StereoRig, paper_rig
 
@@ -131,15 +128,6 @@ def test_nearest_full_view_is_bounded_by_the_tighter_side() -> None:
     depth = wide.nearest_full_view_m(0.33)
     x_low, x_high, *_ = wide.common_field_m(depth + 1e-9, 0.33)
     assert depth == pytest.approx((0.66 + 0.6) / 0.6) and x_high - x_low < 1e-8
-
-
-def test_a_margin_narrows_the_view_on_all_sides() -> None:
-    c = RIG.camera
-    inner = StereoRig(
-        PinholeCamera(c.width_px - 20, c.height_px - 20, c.fx_px, c.fy_px, c.cx_px - 10, c.cy_px - 10), 0.12
-    )
-    assert RIG.nearest_full_view_m(0.33, 10.0) == pytest.approx(inner.nearest_full_view_m(0.33))
-    assert RIG.nearest_full_view_m(0.33, c.height_px / 2) == math.inf
 
 
 def test_body_axes_are_forward_right_down() -> None:
