@@ -9,9 +9,10 @@ This module needs the extra `train`. A sample is a dictionary of tensors that to
 | `time_s` | float64 | mid-exposure [s] |
 | `left_from_drogue` | (4, 4) float64 | the true pose [m], NaN without a drogue |
 | `boxes_px` | (2, 4) float32 | x, y of the low corner, width, height of the whole drogue by eye; NaN without |
-| `keypoints_px` | (2, M, 3) float32 | x, y of each marker's centre, and its visible share, by eye |
+| `keypoints_px` | (2, M, 3) float32 | x, y of each marker's centre, and its visible share, by eye; NaN, NaN, 0 without |
 
-Pixels count from the corner of the image, as in COCO.
+Pixels count from the corner of the image, as in COCO. In the datasets below M is that of the recipe's drogue with the
+most markers.
 
 The last three are missing where a dataset has no truth.
 """
@@ -50,12 +51,13 @@ Transform = Callable[[Sample], Any]
 _CORNER_PX = 0.5
 
 
-def sample_of_pair(pair: StereoPair, with_truth: bool = True) -> Sample:
+def sample_of_pair(pair: StereoPair, with_truth: bool = True, keypoints: int | None = None) -> Sample:
     """The tensors of a pair, as the head of this module lists them.
 
     Args:
         pair: of a dataset, or rendered.
         with_truth: whether to read the truth.
+        keypoints: M, at least the number of the drogue's markers, which it is by default.
 
     Raises:
         ValueError: a file is missing or damaged; names it.
@@ -69,10 +71,10 @@ def sample_of_pair(pair: StereoPair, with_truth: bool = True) -> Sample:
     if with_truth:
         pose = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.as_matrix()
         views = (pair.record.views.left, pair.record.views.right)
-        markers = marker_layout(pair.drogue).count
+        count = marker_layout(pair.drogue).count if keypoints is None else keypoints
         sample["left_from_drogue"] = torch.from_numpy(pose)
         sample["boxes_px"] = torch.from_numpy(np.stack([_box_px(view) for view in views]))
-        sample["keypoints_px"] = torch.from_numpy(np.stack([_keypoints_px(view, markers) for view in views]))
+        sample["keypoints_px"] = torch.from_numpy(np.stack([_keypoints_px(view, count) for view in views]))
     return sample
 
 
@@ -96,6 +98,10 @@ def _keypoints_px(view: ViewRecord, count: int) -> np.ndarray[Any, np.dtype[np.f
         x, y = marker.center_proj_px
         row[:] = x + _CORNER_PX, y + _CORNER_PX, marker.visible_fraction
     return points
+
+
+def _most_markers(recipe: Recipe) -> int:
+    return max(drogue.marker_count for drogue in recipe.drogues)
 
 
 class PairDataset(MapDataset[Any]):
@@ -131,6 +137,7 @@ class PairDataset(MapDataset[Any]):
             whole = [i for i in self.dataset.frame_indices if read_or_note(i, read, self.faults) is not None]
             self.dataset = StereoDataset(self.dataset.path, whole)
         self._transform = transform
+        self._keypoints = _most_markers(self.dataset.reader.manifest.recipe) if self.dataset.has_truth else None
 
     def _read_blind(self, frame_index: int) -> StereoImages:
         return self.dataset.frame(frame_index).images
@@ -146,7 +153,7 @@ class PairDataset(MapDataset[Any]):
             IndexError: no such position.
             ValueError: a file is missing or damaged; names it.
         """
-        sample = sample_of_pair(self.dataset[index], self.dataset.has_truth)
+        sample = sample_of_pair(self.dataset[index], self.dataset.has_truth, self._keypoints)
         return sample if self._transform is None else self._transform(sample)
 
 
@@ -191,6 +198,8 @@ class RenderStream(IterableDataset[Any]):
                 used.
             OSError: the folder cannot be written.
         """
+        if "://" in str(cache):
+            raise ValueError(f"cache: must be a folder of this machine, got {cache}")
         if replays < 0:
             raise ValueError(f"replays: must not be negative, got {replays}")
         if not 0 <= rank < ranks:
@@ -239,7 +248,7 @@ class RenderStream(IterableDataset[Any]):
         for frame_index in self.frame_order(shard, self._ranks * workers, done):
             if not reader.frames.storage.exists(f"{frame_name(frame_index)}/{RECORD_FILE}"):
                 task(frame_index)
-            sample = sample_of_pair(stored_pair(reader, frame_index))
+            sample = sample_of_pair(stored_pair(reader, frame_index), keypoints=_most_markers(self._recipe))
             yield sample if self._transform is None else self._transform(sample)
 
     def frame_order(self, shard: int, shards: int, start: int = 0) -> Iterator[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe import recipe as recipes
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
+from datasets_manifest.storage.storage import as_location
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from droguekit.api.stereo_dataset import StereoDataset, StereoPair
@@ -72,21 +74,22 @@ def render_dataset(
 
     Args:
         recipe: from `load_recipe`.
-        out: folder of the dataset.
+        out: folder of the dataset, or a URL such as `s3://bucket/name`.
         frames: indices of the frames to render; all of the recipe when None.
         workers: number of worker processes; as many as cores and memory allow when None, 0 for this process itself.
         device: to render on: `cpu`, or `cuda` for an NVIDIA GPU.
 
     Raises:
         ValueError: frames outside the recipe, a folder of another recipe, or an engine or device that cannot be used.
+        TypeError: an index of a frame that is no whole number.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
         KeyboardInterrupt: stopped by the user; finished frames stay, and a second call goes on.
     """
-    chosen = range(recipe.frames.count) if frames is None else list(frames)
+    chosen = range(recipe.frames.count) if frames is None else [operator.index(index) for index in frames]
     if workers is not None and workers < 0:
         raise ValueError(f"workers: must not be negative, got {workers}")
     options = ExecutionOptions(workers, device=device)
-    datasets.render_dataset(RecipeSource(recipe, RECIPE_TEXT), Path(out), chosen, options, progress_report())
+    datasets.render_dataset(RecipeSource(recipe, RECIPE_TEXT), as_location(str(out)), chosen, options, progress_report())
     return StereoDataset(out)
 
 

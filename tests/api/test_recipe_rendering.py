@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 import droguekit
 from datasets_manifest.recipe.recipe import load_recipe
 from droguekit.api.stereo_dataset import StereoDataset, StereoPair
+from tests.support.recipe_builder import build_recipe
+from tests.support.small_datasets import SINGLE_PAIRS
 
 
 def labels(pair: StereoPair) -> dict[str, Any]:
@@ -39,6 +42,14 @@ def test_a_pair_by_mitsuba_is_that_of_the_dataset(smoke_dataset: Path) -> None:
     pair = droguekit.render_pair(droguekit.load_recipe("smoke"), 0)
     assert np.array_equal(pair.left, stored.left)
     assert labels(pair) == labels(stored)
+
+
+def test_a_dataset_is_rendered_to_a_url_with_indices_of_any_whole_type() -> None:
+    recipe, place = build_recipe(SINGLE_PAIRS, frames={"count": 3}), f"memory://{uuid.uuid4().hex}/mine"
+    dataset = droguekit.render_dataset(recipe, place, frames=np.arange(1, 3), workers=0)
+    assert [pair.frame_index for pair in dataset] == [1, 2] and dataset.path == place
+    with pytest.raises(TypeError, match="integer"):
+        droguekit.render_dataset(recipe, place, frames=[0.0], workers=0)  # type: ignore[list-item]
 
 
 def test_changes_replace_what_they_name_and_nothing_else() -> None:

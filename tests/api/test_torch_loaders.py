@@ -71,6 +71,29 @@ def test_keypoints_lie_on_markers(pairs: StereoDataset) -> None:
     assert checked > 20
 
 
+def test_drogues_of_unlike_numbers_of_markers_stack_in_one_batch(tmp_path: Path) -> None:
+    variants = [{"drogue": name} for name in ("red-8", "red-5", "white-5")]
+    mixed = build_recipe(
+        SINGLE_PAIRS, frames={"count": 12, "scenes": 12, "empty_fraction": 0.2}, target={"variants": variants}
+    )
+    droguekit.render_dataset(mixed, tmp_path / "mixed", workers=0)
+    stored = PairDataset(tmp_path / "mixed")
+    counts = {pair.drogue.marker_count for pair in stored.dataset if pair.truth is not None}
+    assert counts == {5, 8}
+    for dataset in (stored, RenderStream(mixed, tmp_path / "stream")):
+        (batch,) = DataLoader(dataset, batch_size=12)
+        assert batch["keypoints_px"].shape == (12, 2, 8, 3)
+        for points, pair in zip(batch["keypoints_px"], stored.dataset, strict=True):
+            own = sample_of_pair(pair)["keypoints_px"]
+            np.testing.assert_array_equal(points[:, : own.shape[1]], own)
+            assert points[:, own.shape[1] :, :2].isnan().all() and not points[:, own.shape[1] :, 2].any()
+
+
+def test_a_stream_needs_a_folder_of_this_machine(recipe: Recipe) -> None:
+    with pytest.raises(ValueError, match=r"cache: must be a folder of this machine, got s3://bucket/name"):
+        RenderStream(recipe, "s3://bucket/name")
+
+
 def test_a_loader_with_processes_gives_every_pair_once(pairs: StereoDataset) -> None:
     loader: DataLoader[Any] = DataLoader(
         PairDataset(pairs), batch_size=4, num_workers=2, multiprocessing_context="spawn"
