@@ -99,18 +99,40 @@ def _renamed_on_success(path: Path, is_synced: bool = True) -> Iterator[Path]:
                 yield folder / part.name
                 _write_to_stream(path, folder / part.name)
             return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        with suppress(OSError):  # there is no such file yet, or its file system has no rights
-            shutil.copymode(path, part)
-        part.replace(path)
-        if is_synced:
-            sync_folder(path.parent)
+        with _parents_made(path):
+            try:
+                yield part
+                with suppress(OSError):  # there is no such file yet, or its file system has no rights
+                    shutil.copymode(path, part)
+                part.replace(path)
+            finally:
+                with suppress(OSError):
+                    part.unlink(missing_ok=True)
+            if is_synced:
+                sync_folder(path.parent)
     except OSError as error:
-        raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
+        raise _unwritable(path, error) from error
+
+
+@contextmanager
+def _parents_made(path: Path) -> Iterator[None]:
+    """The folder of a path, with what is missing above it; a failure of the block removes what is new and empty."""
+    made = [folder for folder in path.parents if not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
         with suppress(OSError):
-            part.unlink(missing_ok=True)
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def _unwritable(path: Path, error: OSError) -> OSError:
+    """The error that a path cannot be written; of errors within errors the innermost one has the reason."""
+    while isinstance(error.__cause__, OSError):
+        error = error.__cause__
+    return OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}")
 
 
 def _sync(stream: IO[Any]) -> None:
@@ -152,30 +174,49 @@ def write_bytes_unsynced(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` to write into, which takes that name when the block ends without an error.
+    """A folder to write into, which takes a name when the block ends without an error.
+
+    A folder that exists stays, with its rights, as a mounted one must; it gets the contents at the end.
 
     Args:
-        out: must not exist yet, or be empty.
+        out: must not exist yet, or be empty but for what a killed process left.
 
     Raises:
         ValueError: it exists and is not empty.
         OSError: it cannot be written; one line that names it. Nothing is left behind.
     """
     target = out.resolve()
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+    is_there = target.exists()
+    if is_there and not (target.is_dir() and all(child.name.endswith(PART_SUFFIX) for child in target.iterdir())):
         raise ValueError(f"{out}: is not empty; name a new folder, or delete this one")
-    part = part_path(target)
+    part = part_path(target / "new" if is_there else target)
     try:
-        part.mkdir(parents=True)
-        yield part
-        if target.exists():
-            target.rmdir()
-        part.rename(target)
-        sync_folder(target.parent)
+        with _parents_made(part):
+            part.mkdir()
+            try:
+                yield part
+                if is_there:
+                    _move_contents(part, target)
+                else:
+                    part.rename(target)
+                sync_folder(target.parent)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
-        raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        raise _unwritable(out, error) from error
+
+
+def _move_contents(source: Path, target: Path) -> None:
+    """Move all that is in a folder into another one, or nothing; files last, as they tell that all is there."""
+    moved: list[Path] = []
+    try:
+        for child in sorted(source.iterdir(), key=lambda child: (child.is_file(), child.name)):
+            moved.append(child.rename(target / child.name))
+    except BaseException:
+        for path in moved:
+            path.rename(source / path.name)
+        raise
+    sync_folder(target)
 
 
 def make_scratch_folder(folder: Path | None = None) -> Path:

@@ -9,7 +9,7 @@ This module needs the extra `train`. A sample is a dictionary of tensors that to
 | `time_s` | float64 | mid-exposure [s] |
 | `left_from_drogue` | (4, 4) float64 | the true pose [m], NaN without a drogue |
 | `boxes_px` | (2, 4) float32 | x, y of the low corner, width, height of the whole drogue by eye; NaN without |
-| `keypoints_px` | (2, M, 3) float32 | x, y of each marker's centre, and its visible share, by eye; NaN, NaN, 0 without |
+| `keypoints_px` | (2, M, 3) float32 | x, y of each marker's centre, and its visible share, by eye; NaN and 0 without |
 
 Pixels count from the corner of the image, as in COCO. In the datasets below M is that of the recipe's drogue with the
 most markers.

@@ -89,7 +89,9 @@ def render_dataset(
     if workers is not None and workers < 0:
         raise ValueError(f"workers: must not be negative, got {workers}")
     options = ExecutionOptions(workers, device=device)
-    datasets.render_dataset(RecipeSource(recipe, RECIPE_TEXT), as_location(str(out)), chosen, options, progress_report())
+    datasets.render_dataset(
+        RecipeSource(recipe, RECIPE_TEXT), as_location(str(out)), chosen, options, progress_report()
+    )
     return StereoDataset(out)
 
 

@@ -27,12 +27,13 @@ from datasets_manifest.recipe.file_names import move_file_names
 from datasets_manifest.recipe.recipe import MAX_SEED, Recipe, parse_recipe
 from datasets_manifest.storage.layout import RECIPE_FILE
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.storage import Location, join, open_storage
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.untrusted_files import read_text
 from droguekit.assurance.solved_cases import solved_cases
 from droguekit.batch.progress import ProgressReport
+from droguekit.batch.resume import differing_keys
 from scenes.framing import distance_at
 
 # A bin's failures count beside so many cases with the mean failure fraction.
@@ -218,13 +219,17 @@ def _recipe_of(source: Dataset, given: Path | None) -> tuple[str, Recipe]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{given or source.path}: the recipe is not valid UTF-8: {error}") from error
     try:
-        read = parse_recipe(text, given.parent if given else None, old.seed)
+        # The command `render` takes seed and engine as options.
+        engine = {"render": {"engine": old.render.engine}}
+        read = parse_recipe(text, given.parent if given else None, old.seed, engine)
     except ValueError as error:
         raise ValueError(f"{given or RECIPE_FILE}: {error}; give the recipe's file with --recipe") from error
-    if read.model_copy(update={"frames": old.frames, "name": old.name}).model_dump_json() != old.model_dump_json():
+    read = read.model_copy(update={"frames": old.frames, "name": old.name})
+    differing = differing_keys(read.model_dump(mode="json"), old.model_dump(mode="json"))
+    if differing:
         raise ValueError(
-            f"{given or RECIPE_FILE}: is not all of the recipe that {source.path} was rendered from; give its file "
-            "with --recipe"
+            f"{given or join(source.path, RECIPE_FILE)}: differs in {', '.join(differing[:3])} from the recipe that "
+            f"{source.path} was rendered from; give its file with --recipe"
         )
     return text, old
 

@@ -139,4 +139,6 @@ def _why_unwritable(path: Path, is_folder: bool) -> int | None:
         folder = folder.parent
     if not folder.is_dir():
         return errno.ENOTDIR
-    return None if os.access(folder, os.W_OK | os.X_OK) else errno.EACCES
+    if os.access(folder, os.W_OK | os.X_OK):
+        return None
+    return errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES

@@ -104,7 +104,7 @@ def check_blind(dataset: Location, estimates: Path, faults: PairFaults | None = 
         dataset=BlindFacts(name=index.name, pairs=len(index.frames)),
         code_version=version("droguekit"),
         methods={
-            name: _row({i: estimate for i, estimate in found.items() if i in scenes}, scenes)
+            name: _row({i: estimate for i, estimate in found.items() if i in scenes}, scenes, estimates)
             for name, found in methods.items()
         },
     )
@@ -149,9 +149,9 @@ def rim_box_px(scene: BlindScene, left_from_drogue: RigidTransform, eye: Eye) ->
     return (float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1]))
 
 
-def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene]) -> BlindRow:
+def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene], source: Path) -> BlindRow:
     fixes = {frame: e for frame, e in estimates.items() if isinstance(e, PoseEstimate)}
-    residuals = [r for frame, e in fixes.items() for r in _residuals_px(e, scenes[frame])]
+    residuals = [r for frame, e in fixes.items() for r in _residuals_px(e, scenes[frame], source)]
     views = [
         (given, rim_box_px(scenes[frame], e.left_from_drogue, eye))
         for frame, e in fixes.items()
@@ -171,7 +171,7 @@ def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene]) ->
     )
 
 
-def _residuals_px(estimate: PoseEstimate, scene: BlindScene) -> Iterator[float]:
+def _residuals_px(estimate: PoseEstimate, scene: BlindScene, source: Path) -> Iterator[float]:
     """Measured minus expected, both coordinates of every feature that the pose was computed from."""
     for eye in EYES:
         used = [feature for feature in estimate.features if feature.eye == eye and feature.used]
@@ -180,9 +180,7 @@ def _residuals_px(estimate: PoseEstimate, scene: BlindScene) -> Iterator[float]:
         for feature in used:
             place = count if feature.index == "hub" else int(feature.index)
             if not 0 <= place < len(expected):
-                raise ValueError(
-                    f"estimates: frame {estimate.frame_index}: feature {feature.index} is not the drogue's"
-                )
+                raise ValueError(f"{source}: frame {estimate.frame_index}: feature {feature.index} is not the drogue's")
             yield from (np.array(feature.center_px) - expected[place]).tolist()
 
 

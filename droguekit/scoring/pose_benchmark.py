@@ -90,7 +90,7 @@ def score_estimates(
         truths[index] = drogue_truth(record)
         states.append(true_state(record))
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(truths))
-    return score_methods(facts, truths, methods, true_sequences(states))
+    return score_methods(facts, truths, methods, true_sequences(states), source)
 
 
 def score_methods(
@@ -98,6 +98,7 @@ def score_methods(
     truths: Truths,
     methods: Mapping[str, Mapping[int, Estimate]],
     sequences: Sequence[TrueSequence] = (),
+    source: str = "estimates",
 ) -> BenchmarkResult:
     """Score estimates that are sorted by method and frame against the truth of each frame.
 
@@ -106,6 +107,7 @@ def score_methods(
         truths: by frame.
         methods: estimates by method and frame.
         sequences: the same frames as they follow each other, where they do.
+        source: what to call the estimates in errors.
 
     Raises:
         ValueError: no pair shows a drogue, or a feature that the drogue does not have.
@@ -113,7 +115,7 @@ def score_methods(
     drogues = {index: truth for index, truth in sorted(truths.items()) if truth is not None}
     if not drogues:
         raise ValueError("dataset: no pair shows a drogue, so there is nothing to compare poses with")
-    centroids = {name: _centroids(name, drogues, estimates) for name, estimates in methods.items()}
+    centroids = {name: _centroids(name, drogues, estimates, source) for name, estimates in methods.items()}
     reference = build_reference(drogues, centroids)
     scores = {name: frame_scores(drogues, methods[name], centroids[name], reference) for name in methods}
     rows = {
@@ -214,7 +216,7 @@ def _comparisons(
 
 
 def _centroids(
-    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]
+    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate], source: str
 ) -> dict[int, CentroidErrors]:
     found = {}
     for index, truth in drogues.items():
@@ -222,7 +224,7 @@ def _centroids(
         try:
             found[index] = centroid_errors(truth, estimate.features if estimate is not None else ())
         except ValueError as error:
-            raise ValueError(f"estimates: method {method!r}: frame {index}: {error}") from error
+            raise ValueError(f"{source}: method {method!r}: frame {index}: {error}") from error
     return found
 
 

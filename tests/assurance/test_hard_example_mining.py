@@ -178,6 +178,16 @@ def test_a_recipe_in_another_folder_finds_its_drogue(tmp_path: Path, capsys: pyt
     capsys.readouterr()
 
 
+def test_a_dataset_of_another_engine_can_be_mined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old, out, dataset = (tmp_path / name for name in ("old.toml", "harder.toml", "dataset"))
+    old.write_text(text_of(render={"engine": "mitsuba"}))
+    assert run(["render", str(old), "--engine", "analytic", "--out", str(dataset)]) == DONE
+    poses = write_failures(dataset, tmp_path / "poses.jsonl")
+    assert run(["mine", str(dataset), "--estimates", str(poses), "--out", str(out)]) == DONE
+    assert parse_recipe(out.read_text()).render.engine == "mitsuba"
+    capsys.readouterr()
+
+
 def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, out = write_failures(dataset, tmp_path / "poses.jsonl"), tmp_path / "harder.toml"
     plain = ["mine", str(dataset), "--out", str(out)]
@@ -193,5 +203,5 @@ def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: py
     changed = tmp_path / "other.toml"
     changed.write_text(text_of(distance=between(2.0, 30.0)))
     assert run([*plain, "--estimates", str(poses), "--recipe", str(changed)]) == WRONG_INPUT
-    assert "give its file with --recipe" in capsys.readouterr().err
+    assert "other.toml: differs in distance.law, " in capsys.readouterr().err
     assert not out.exists()

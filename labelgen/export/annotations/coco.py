@@ -157,6 +157,10 @@ def _write(
                 log_missing_labels(log, record, eye, masked)
         for writer in writers.values():
             writer.finish()
+    # Of an older export: with its images beside those of this one, two datasets would be one.
+    for split in ("train", "val", "test"):
+        if split not in files and target.exists(f"{own}{split}.json"):
+            target.delete(f"{own}{split}.json")
     return list(files.values())
 
 

@@ -203,11 +203,13 @@ def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates:
     """Write truth and estimates, and return the names of their folders."""
     methods = _poses_by_method(estimates)
     has_truth = not open_storage(dataset).exists(BLIND_FILE)
+    pairs = Dataset(dataset).frame_indices if has_truth else read_blind_index(dataset).frames
+    strange = {index for poses in methods.values() for index in poses} - set(pairs)
+    if strange:
+        raise ValueError(f"{estimates}: frame {min(strange)} is not in the dataset")
     with ExitStack() as stack:
         writer = _TrajectoryFolders(stack, folder, [*([TRUTH_FOLDER] if has_truth else []), *methods])
-        seen = set()
         for frame_index, stamp_ns, name, record in _places(dataset, log, has_truth):
-            seen.add(frame_index)
             truth = None if record is None else record.left_from_drogue
             if truth is not None:
                 writer.add(TRUTH_FOLDER, name, _line(truth, stamp_ns))
@@ -219,9 +221,6 @@ def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates:
                 if record is not None and truth is not None:
                     pose = _nearest_turn(pose, truth, _turns(record))
                 writer.add(method, name, _line(pose, stamp_ns))
-        strange = {index for poses in methods.values() for index in poses} - seen
-        if strange:
-            raise ValueError(f"{estimates}: frame {min(strange)} is not in the dataset")
     return writer.names
 
 

@@ -19,6 +19,7 @@ from labelgen.export.frame_files import DISPLAY_REMARK
 from labelgen.export.keypoints import view_of
 from tests.support.display_encoding import shown
 from tests.support.other_python import read_by
+from tests.support.whole_dataset import write_whole_dataset
 
 READ_BY_DATUMARO = """
 import json, sys
@@ -175,3 +176,15 @@ def test_the_views_of_the_datasets_own_images_are_named_without_copies(mixed_dat
         for index in source.frame_indices
         for eye in EYES
     )
+
+
+def test_files_of_an_older_exports_splits_do_not_stay(tmp_path: Path) -> None:
+    dataset, out = tmp_path / "dataset", tmp_path / "out"
+    write_whole_dataset(dataset)
+    out.mkdir()
+    (out / "notes.json").write_text("{}")
+    for split in ("train", "val", "test"):
+        (out / f"{split}.json").write_text("{}")
+    files = write_export("coco", dataset, out, ExportLog())
+    assert {path.name for path in files} == {"all.json", "train.json", "test.json"}
+    assert {path.name for path in out.iterdir()} == {path.name for path in files} | {"notes.json"}

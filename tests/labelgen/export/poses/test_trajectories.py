@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from geometry.se3 import RigidTransform
@@ -100,6 +102,19 @@ def test_a_dataset_without_truth_has_estimates_alone(dataset: Path, tmp_path: Pa
     np.testing.assert_allclose(got[:, 0], [record.time_s for record in truth], atol=1e-9)
     positions_m = [record.left_from_drogue.translation_m for record in truth if record.left_from_drogue is not None]
     np.testing.assert_array_equal(got[:, 1:4], positions_m)
+
+
+def test_estimates_of_a_damaged_pair_are_left_out_with_it(dataset: Path, tmp_path: Path) -> None:
+    estimates, faults = estimates_of(dataset, tmp_path / "estimates.jsonl"), PairFaults()
+    write_export("tum", dataset, tmp_path / "whole", ExportLog(), estimates=estimates)
+    shutil.copytree(dataset, tmp_path / "damaged")
+    last = Dataset(dataset).frame_indices[-1]
+    (tmp_path / "damaged" / "frames" / f"{last:06d}" / "record.json").write_text("{")
+    write_export("tum", tmp_path / "damaged", tmp_path / "out", ExportLog(faults=faults), estimates=estimates)
+    assert faults.count == 1 and faults.first is not None and faults.first[0] == last
+    for name in ("truth", "exact"):
+        whole, rest = (numbers(tmp_path / out / name / "single_pairs.txt") for out in ("whole", "out"))
+        np.testing.assert_array_equal(rest, whole[:-1])
 
 
 @pytest.mark.parametrize(
