@@ -227,11 +227,14 @@ def _drawn_boxes(table: dict[str, Any], category: str | None) -> list[DrawnBox]:
     images = {_number(image["id"]): image for image in table["images"]}
     if len(images) < len(table["images"]):
         raise ValueError("images: two have the same id")
-    wanted = _category_id(table.get("categories", []), category)
+    categories = table.get("categories", [])
+    wanted, known = _category_id(categories, category), {one["id"] for one in categories}
     boxes: list[DrawnBox] = []
     for annotation in table["annotations"]:
         name = f"annotation {annotation.get('id', len(boxes))}"
-        if wanted is not None and annotation.get("category_id") != wanted:
+        if wanted is not None and annotation.get("category_id") not in known:
+            raise ValueError(f"{name}: no category has its category_id {annotation.get('category_id')}")
+        if wanted is not None and annotation["category_id"] != wanted:
             continue
         image = images.get(_number(annotation.get("image_id")))
         if image is None:

@@ -114,6 +114,10 @@ def test_the_drogues_category_is_taken_or_asked_for(tmp_path: Path) -> None:
     path.write_text(json.dumps(table))
     assert [drawn.image_name for drawn in read_boxes(path).boxes] == ["2.png"]
     assert [drawn.image_name for drawn in read_boxes(path, "probe").boxes] == ["1.png"]
+    table["annotations"][0]["category_id"] = 3
+    path.write_text(json.dumps(table))
+    with pytest.raises(ValueError, match=r"boxes\.json: annotation 11: no category has its category_id 3"):
+        read_boxes(path)
     with pytest.raises(ValueError, match=r"none named hose; choose by --box-category from probe, Drogue"):
         read_boxes(path, "hose")
     table["categories"][1]["name"] = "basket"
