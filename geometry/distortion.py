@@ -7,6 +7,7 @@ corresponds to one pixel of the ideal, rectified image with the same ray, and th
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +15,13 @@ from numpy.typing import ArrayLike
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, read_only
 
-_MAX_STEPS = 30
+_MAX_STEPS = 60
 _TOLERANCE = 1e-13
+# Near enough for Newton's method to go on without care; closer to the solution rounding moves the error up and down.
+_NEARLY = 1e-9
 _BORDER_POINTS = 32
+# Between the axis and each point of the border, in search of a fold. A narrower fold moves no pixel by a tenth.
+_POINTS_TO_BORDER = 64
 
 
 @dataclass(frozen=True)
@@ -49,24 +54,46 @@ class BrownConrady:
         return self._distort(np.asarray(places, dtype=np.float64))[0]
 
     def undistort(self, places: ArrayLike) -> Array:
-        """(..., 2) ideal points of (..., 2) distorted ones, by Newton's method to rounding errors.
+        """(..., 2) ideal points of (..., 2) distorted ones, by Newton's method with halved steps, to rounding errors.
 
         Raises:
             ValueError: a point outside the region where the distortion is invertible.
         """
         wanted = np.asarray(places, dtype=np.float64)
-        ideal = wanted.copy()
+        # Steps go from `last` along `step`: the first from the axis, where no lens folds, to the distorted points.
+        last, step = np.zeros_like(wanted), wanted.copy()
+        last_size = np.full(wanted.shape[:-1], np.inf)
         for _ in range(_MAX_STEPS):
+            ideal = last + step
             seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
             error = wanted - seen
-            if np.abs(error).max(initial=0.0) < _TOLERANCE:
+            size = np.abs(error).max(axis=-1, initial=0.0)
+            if size.max(initial=0.0) < _TOLERANCE:
                 return ideal
             determinant = j_xx * j_yy - j_xy * j_yx
-            if not (determinant > 0).all():
-                break
-            ideal[..., 0] += (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant
-            ideal[..., 1] += (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant
-        raise ValueError(
+            good = (determinant > 0) & ((size < last_size) | (size < _NEARLY))
+            determinant = np.where(good, determinant, 1.0)
+            newton = np.stack(
+                [
+                    (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant,
+                    (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant,
+                ],
+                axis=-1,
+            )
+            # A step across a fold, or one that leads away, is halved.
+            last, step = np.where(good[..., None], ideal, last), np.where(good[..., None], newton, step / 2)
+            last_size = np.where(good, size, last_size)
+        raise self.folds()
+
+    def stretch(self, places: ArrayLike) -> Array:
+        """(...) area of the distorted image over that of the ideal one at (..., 2) ideal points; 0 on a fold."""
+        _, j_xx, j_xy, j_yx, j_yy = self._distort(np.asarray(places, dtype=np.float64))
+        determinant: Array = j_xx * j_yy - j_xy * j_yx
+        return determinant
+
+    def folds(self) -> ValueError:
+        """The error of a distortion that maps several points of an image to one."""
+        return ValueError(
             f"distortion: {self.coefficients().tolist()} is not invertible over the whole image; make it weaker"
         )
 
@@ -170,6 +197,9 @@ class Lens:
         camera: intrinsics of the real image.
         distortion: of the lens.
         ideal_from_real: (3, 3) rotation from the real eye's axes to those of the rectified rig.
+
+    Raises:
+        ValueError: the distortion is not invertible over the whole image.
     """
 
     camera: PinholeCamera
@@ -180,7 +210,7 @@ class Lens:
         # RigidTransform checks that it is a rotation.
         rotation = RigidTransform(read_only(self.ideal_from_real, (3, 3), "ideal_from_real"), np.zeros(3)).rotation
         object.__setattr__(self, "ideal_from_real", rotation)
-        self.rays(border_px(self.camera))
+        _undistorted_grid(self.camera, self.distortion)
 
     def rays(self, real_px: ArrayLike) -> Array:
         """(..., 3) directions in the rig's axes through (..., 2) pixels of the real image, scaled to z = 1.
@@ -203,7 +233,30 @@ class Lens:
 
 def border_px(camera: PinholeCamera) -> Array:
     """(M, 2) points around the border of an image. [px]"""
+    grid = _grid_px(camera)
+    return np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+
+
+def _grid_px(camera: PinholeCamera) -> Array:
+    """(N, N, 2) points evenly spaced over an image, from border to border. [px]"""
     u = np.linspace(-0.5, camera.width_px - 0.5, _BORDER_POINTS)
     v = np.linspace(-0.5, camera.height_px - 0.5, _BORDER_POINTS)
-    ends_u, ends_v = np.repeat(u[[0, -1]], _BORDER_POINTS), np.repeat(v[[0, -1]], _BORDER_POINTS)
-    return np.stack([np.concatenate([u, u, ends_u]), np.concatenate([ends_v, v, v])], axis=-1)
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+# A dataset has one rig, which every record repeats.
+@lru_cache(maxsize=64)
+def _undistorted_grid(camera: PinholeCamera, distortion: BrownConrady) -> Array:
+    """(N, N, 2) ideal points, in the image plane at unit distance, of the grid of an image.
+
+    Raises:
+        ValueError: the distortion is not invertible over the whole image.
+    """
+    grid = distortion.undistort(camera.rays(_grid_px(camera))[..., :2])
+    # Points on both sides of a narrow fold are inverted; the fold lies between them.
+    outline = np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+    shares = np.linspace(0.0, 1.0, _POINTS_TO_BORDER)[:, None, None]
+    if not (distortion.stretch(shares * outline) > 0).all():
+        raise distortion.folds()
+    grid.flags.writeable = False
+    return grid

@@ -117,6 +117,36 @@ def test_a_fold_and_a_foreign_size_are_refused() -> None:
         StereoRig(IDEAL.camera, 0.12, lenses=(small, small))
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "k1", "k2", "k3"),
+    [
+        # Found at random: the border is past both folds, and a ring around the middle has three rays a pixel.
+        pytest.param(300.0, -1.46, 0.886, 0.0, id="wide"),
+        pytest.param(400.0, -1.2, 0.6, 0.0, id="long"),
+        # Three rays meet a pixel only in a ring of 0.2 px, which no coarse grid of pixels meets.
+        pytest.param(400.0, -0.8, 0.287, 0.0, id="narrow"),
+    ],
+)
+def test_a_fold_inside_the_image_is_refused(focal_px: float, k1: float, k2: float, k3: float) -> None:
+    with pytest.raises(ValueError, match="is not invertible over the whole image"):
+        Lens(PinholeCamera(1280, 960, focal_px, focal_px, 639.5, 479.5), BrownConrady(k1=k1, k2=k2, k3=k3))
+
+
+def test_every_pixel_of_an_accepted_lens_has_a_ray() -> None:
+    rng = np.random.default_rng(7)
+    pixels = np.stack(np.meshgrid(np.arange(0, 1280, 16.0), np.arange(0, 960, 16.0)), axis=-1)
+    accepted = 0
+    for _ in range(400):
+        focal_px, k1, k2, k3 = rng.uniform([300.0, -2.0, -2.0, -2.0], [800.0, 2.0, 2.0, 2.0])
+        try:
+            lens = Lens(PinholeCamera(1280, 960, focal_px, focal_px, 639.5, 479.5), BrownConrady(k1=k1, k2=k2, k3=k3))
+        except ValueError:
+            continue
+        accepted += 1
+        np.testing.assert_allclose(lens.project_rays(lens.rays(pixels)), pixels, atol=1e-8)
+    assert accepted > 50
+
+
 # Of a wide-angle RGB-D camera, by orders of magnitude: rational with near-cancelling numerator and denominator.
 WIDE = OpenCvDistortion(0.52, -2.5, 4e-4, -3e-4, 1.5, k4=0.40, k5=-2.3, k6=1.4)
 PRISM = OpenCvDistortion(-0.1, 0.05, 2e-4, -1e-4, 0.01, 0.02, -0.01, 0.003, 1e-3, -5e-4, -8e-4, 3e-4)
