@@ -61,7 +61,8 @@ def disc_image_centers(
     """Centroids of the areas that discs cover in the delivered image; arguments as `project_disc_centers`.
 
     In an ideal eye they are the centres of the image ellipses. Behind a distorting lens the image of a disc is not an
-    ellipse; its centroid is that of a polygon through its edge.
+    ellipse; its centroid is that of a polygon through its edge. A disc that reaches beyond the lens's field gets the
+    image of its own centre.
 
     Returns:
         (N, 2) pixel coordinates. [px]
@@ -72,7 +73,14 @@ def disc_image_centers(
     if len(centers) != len(radii):
         raise ValueError(f"radii_m: {len(radii)} for {len(centers)} discs")
     outlines = disc_outline(left_from_drogue, centers, radii, _OUTLINE_POINTS)
-    return np.stack([_polygon_centroid(rig.image(outline, eye)) for outline in outlines])
+    return np.stack(
+        [
+            _polygon_centroid(rig.image(outline, eye))
+            if rig.is_in_field(rig.project(outline, eye), eye).all()
+            else rig.image(left_from_drogue.apply(center), eye)
+            for center, outline in zip(centers, outlines, strict=True)
+        ]
+    )
 
 
 def _polygon_centroid(corners: Array) -> Array:

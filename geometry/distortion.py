@@ -7,10 +7,10 @@ corresponds to one pixel of the ideal, rectified image with the same ray, and th
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, read_only
@@ -20,8 +20,10 @@ _TOLERANCE = 1e-13
 # Near enough for Newton's method to go on without care; closer to the solution rounding moves the error up and down.
 _NEARLY = 1e-9
 _BORDER_POINTS = 32
-# Between the axis and each point of the border, in search of a fold. A narrower fold moves no pixel by a tenth.
-_POINTS_TO_BORDER = 64
+# The field reaches beyond the image by so many times its width and height, the first with which the lens does not fold.
+_FIELD_MARGINS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.025, 0.0125, 0.0)
+# Shares of the way from the axis to a point of the border or of the field's edge, for a search for folds.
+_SHARES = np.linspace(0.0, 1.0, 64)[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -218,23 +220,85 @@ class Lens:
         Raises:
             ValueError: the distortion is not invertible there.
         """
-        seen = self.camera.rays(real_px)
-        seen[..., :2] = self.distortion.undistort(seen[..., :2])
-        turned = np.einsum("ij,...j->...i", self.ideal_from_real, seen)
+        return self._in_rig(self.distortion.undistort(self.camera.rays(real_px)[..., :2]))
+
+    @cached_property
+    def field(self) -> Array:
+        """(2, 2) lowest and highest x and y, at z = 1 in the rig's axes, of all rays of the image, with a margin.
+
+        The margin is as wide as the lens is one-to-one, at most four times width and height. Beyond, the polynomial of
+        a lens may fold back: there it says nothing about what the eye sees.
+        """
+        rays = self._in_rig(_undistorted_grid(self.camera, self.distortion))
+        low, high = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
+        for margin in _FIELD_MARGINS:
+            field = np.stack([low - margin * (high - low), high + margin * (high - low)])
+            if (self._stretch(_with_one(_SHARES * _edge_of(field))) > 0).all():
+                break
+        field.flags.writeable = False
+        return field
+
+    def is_in_field(self, rays: ArrayLike) -> NDArray[np.bool_]:
+        """(...) whether (..., 3) rays in the rig's axes, z > 0, lie on the image, or in the margin around it."""
+        directions = np.asarray(rays, dtype=np.float64)
+        places = directions[..., :2] / directions[..., 2:]
+        low, high = self.field
+        inside = ((places >= low) & (places <= high)).all(axis=-1)
+        # A corner of the field may lie beyond a fold.
+        inside[inside] = self._stretch(directions[inside]) > 0
+        return inside
+
+    def into_field(self, rays: ArrayLike) -> Array:
+        """(..., 3) rays in the rig's axes, z > 0; those beyond the field, moved to its edge, outside the image."""
+        directions = np.asarray(rays, dtype=np.float64)
+        places = directions[..., :2] / directions[..., 2:]
+        low, high = self.field
+        beyond = ~((places >= low) & (places <= high)).all(axis=-1)
+        if not beyond.any():
+            return directions
+        moved = directions.copy()
+        moved[beyond, :2], moved[beyond, 2] = np.clip(places[beyond], low, high), 1.0
+        return moved
+
+    def _in_rig(self, places: Array) -> Array:
+        """(..., 3) directions in the rig's axes, scaled to z = 1, of (..., 2) ideal points at unit distance."""
+        turned = np.einsum("ij,...j->...i", self.ideal_from_real, _with_one(places))
         rays: Array = turned / turned[..., 2:]
         return rays
+
+    def _stretch(self, rays: Array) -> Array:
+        """(...) the distortion's `stretch` along (..., 3) rays in the rig's axes, 0 for those behind the eye."""
+        turned = np.einsum("ji,...j->...i", self.ideal_from_real, rays)
+        ahead = turned[..., 2] > 0
+        stretch = self.distortion.stretch(turned[..., :2] / np.where(ahead, turned[..., 2], 1.0)[..., None])
+        return np.where(ahead, stretch, 0.0)
 
     def project_rays(self, rays: ArrayLike) -> Array:
         """(..., 2) pixels of the real image of (..., 3) directions in the rig's axes, z > 0. [px]"""
         turned = np.einsum("ji,...j->...i", self.ideal_from_real, np.asarray(rays, dtype=np.float64))
         seen = self.distortion.distort(turned[..., :2] / turned[..., 2:])
-        return self.camera.project(np.concatenate([seen, np.ones_like(seen[..., :1])], axis=-1))
+        return self.camera.project(_with_one(seen))
+
+
+def _with_one(places: Array) -> Array:
+    """(..., 3) directions of (..., 2) points of the image plane at unit distance."""
+    return np.concatenate([places, np.ones_like(places[..., :1])], axis=-1)
+
+
+def _edge_of(field: Array) -> Array:
+    """(M, 2) x and y around the edge of a field."""
+    grid = np.stack(np.meshgrid(*np.linspace(*field, _BORDER_POINTS).T), axis=-1)
+    return _outline(grid)
+
+
+def _outline(grid: Array) -> Array:
+    """(M, 2) the outer points of an (N, N, 2) grid."""
+    return np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
 
 
 def border_px(camera: PinholeCamera) -> Array:
     """(M, 2) points around the border of an image. [px]"""
-    grid = _grid_px(camera)
-    return np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+    return _outline(_grid_px(camera))
 
 
 def _grid_px(camera: PinholeCamera) -> Array:
@@ -254,9 +318,7 @@ def _undistorted_grid(camera: PinholeCamera, distortion: BrownConrady) -> Array:
     """
     grid = distortion.undistort(camera.rays(_grid_px(camera))[..., :2])
     # Points on both sides of a narrow fold are inverted; the fold lies between them.
-    outline = np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
-    shares = np.linspace(0.0, 1.0, _POINTS_TO_BORDER)[:, None, None]
-    if not (distortion.stretch(shares * outline) > 0).all():
+    if not (distortion.stretch(_SHARES * _outline(grid)) > 0).all():
         raise distortion.folds()
     grid.flags.writeable = False
     return grid

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geometry.distortion import Lens, border_px
 from geometry.pinhole import PinholeCamera
@@ -76,8 +76,41 @@ class StereoRig:
         return self.camera.rays(real_px) if lens is None else lens.rays(real_px)
 
     def image(self, points_left_m: ArrayLike, eye: Eye) -> Array:
-        """(..., 2) projection of (..., 3) points in the left camera frame into the delivered image of an eye. [px]"""
-        return self.real_px(self.project(points_left_m, eye), eye)
+        """Projection of points into the delivered image of an eye.
+
+        The polynomial of a lens may fold points back that lie far aside of what the eye sees. So points beyond its
+        field (`is_in_field`) are moved to the field's edge, which lies outside the image.
+
+        Args:
+            points_left_m: (..., 3) in the left camera frame, in front of the eye. [m]
+            eye: which image.
+
+        Returns:
+            (..., 2) pixels. [px]
+        """
+        ideal, lens = self.project(points_left_m, eye), self.lens(eye)
+        return ideal if lens is None else lens.project_rays(lens.into_field(self.camera.rays(ideal)))
+
+    def is_in_field(self, ideal_px: ArrayLike, eye: Eye) -> NDArray[np.bool_]:
+        """(...) whether (..., 2) pixels of the ideal image lie on the delivered one, or in a margin around it.
+
+        There a lens is one-to-one, and `real_px` is what the eye sees. An ideal eye's field has no end.
+        """
+        lens = self.lens(eye)
+        if lens is None:
+            return np.ones(np.shape(ideal_px)[:-1], dtype=np.bool_)
+        return lens.is_in_field(self.camera.rays(ideal_px))
+
+    def field_px(self, eye: Eye) -> Array:
+        """(2, 2) lowest and highest pixels of the ideal image in the field of an eye with a lens. [px]
+
+        Raises:
+            ValueError: an ideal eye, whose field has no end.
+        """
+        lens = self.lens(eye)
+        if lens is None:
+            raise ValueError(f"eye: the {eye} one has no lens, and no end of its field")
+        return self.camera.project(np.column_stack([lens.field, np.ones(2)]))
 
     def largest_shift_px(self) -> float:
         """Largest displacement by the lenses along the border of an ideal image; 0 for ideal eyes. [px]"""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.meshes import HOSE_SECTIONS, hose_mesh
 from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, INSTANCE_STEP, Part
-from geometry.distortion import border_px
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 from scenes.ground.terrain import highest_sine
@@ -23,8 +22,6 @@ from scenes.ground.terrain import highest_sine
 _GROUND_COVER_M = 30.0
 # Two poses that move a point by less than this move it alike. [m]
 _SAME_MOTION_M = 1e-9
-# A model of a lens says nothing far outside its image; so far beyond the border it is still asked.
-_LENS_MARGIN = 0.1
 # Steepest slope of a surface that the test for hidden points follows.
 _LEAST_COSINE = 0.1
 _HOSE_STEPS, _HOSE_BLOCK = 4, 4096
@@ -126,9 +123,7 @@ def _matches(rig: StereoRig, eye: Eye, points: Array, far: NDArray[np.bool_], ot
     height, width = far.shape
     points = np.where((points[..., 2] > 0)[..., None], points, np.nan)
     ideal = rig.camera.project(points)
-    if rig.lens(eye) is not None:
-        ideal[_is_beyond_lens(rig, eye, ideal)] = np.nan
-    known = np.isfinite(ideal[..., 0])
+    known = np.isfinite(ideal[..., 0]) & rig.is_in_field(ideal, eye)
     target = np.full_like(ideal, np.nan)
     target[known] = rig.real_px(ideal[known], eye)
     inside = known & rig.camera.contains(np.where(known[..., None], target, -1.0))
@@ -137,14 +132,6 @@ def _matches(rig: StereoRig, eye: Eye, points: Array, far: NDArray[np.bool_], ot
     hidden[inside] = _is_hidden(rig, eye, target[inside], depth_m[inside], other)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     return PixelMatches(displacement_px=target - pixels, hidden=hidden, outside=known & ~inside)
-
-
-def _is_beyond_lens(rig: StereoRig, eye: Eye, ideal_px: Array) -> NDArray[np.bool_]:
-    border = rig.ideal_px(border_px(rig.camera), eye)
-    low, high = border.min(axis=0), border.max(axis=0)
-    margin = _LENS_MARGIN * (high - low)
-    beyond: NDArray[np.bool_] = ((ideal_px < low - margin) | (ideal_px > high + margin)).any(axis=-1)
-    return beyond
 
 
 def _is_hidden(rig: StereoRig, eye: Eye, target_px: Array, depth_m: Array, other: SurfacePasses) -> NDArray[np.bool_]:

@@ -54,7 +54,10 @@ class DiscInEye:
         return conic
 
     def extent_px(self) -> tuple[float, float, float, float]:
-        """Lowest u, lowest v, highest u, highest v of the disc's image. [px]"""
+        """Lowest u, lowest v, highest u, highest v of the disc's image. [px]
+
+        Points beyond the field of a lens count as on its edge, outside the image.
+        """
         if self.lens is not None:
             return self._extent_through(self.lens)
         d = self.dual_conic() / self.dual_conic()[2, 2]
@@ -67,7 +70,7 @@ class DiscInEye:
         across = np.linalg.svd(self.normal[None])[2][1:]
         angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
         edge_m = self.center_m + self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ across
-        image = lens.project_rays(edge_m)
+        image = lens.project_rays(lens.into_field(edge_m))
         (u_low, v_low), (u_high, v_high) = image.min(axis=0).tolist(), image.max(axis=0).tolist()
         return u_low, v_low, u_high, v_high
 

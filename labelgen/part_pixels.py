@@ -69,6 +69,8 @@ def drogue_hull_m(drogue: DrogueParameters) -> Array:
 def drogue_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: RigidTransform, eye: Eye) -> PixelBox:
     """Box around the image of the whole drogue, neither clipped by the frame nor occluded. [px]
 
+    Behind a lens it ends with the lens's field (`StereoRig.image`).
+
     Raises:
         ValueError: part of the drogue is not in front of the camera.
     """

@@ -23,7 +23,7 @@ OCCLUDERS = (int(Part.PROBE), int(Part.OBSTACLE))
 # No part is closer to an eye. [m]
 _NEAR_M = 0.01
 
-# Field of view with a margin; beyond it a lens's polynomial may fold back into the image.
+# Field of view with a margin.
 _FIELD_MARGIN = 1.05
 
 # A strong lens bends an edge of this length by 3e-3 px (curvature 1e-4 / px), which changes no pixel in a hundred.
@@ -141,8 +141,10 @@ def silhouette(triangles_m: Array, rig: StereoRig, eye: Eye) -> NDArray[np.bool_
 def _field_planes(rig: StereoRig, eye: Eye) -> Array:
     """(5, 4) planes around the field of view: a point p is inside where `plane[:3] @ p >= plane[3]`."""
     lens = rig.lens(eye)
-    rays = rig.rays(border_px(rig.camera if lens is None else lens.camera), eye)
+    rays = rig.rays(border_px(rig.camera), eye)
     low, high = rays[:, :2].min(axis=0) * _FIELD_MARGIN, rays[:, :2].max(axis=0) * _FIELD_MARGIN
+    if lens is not None:
+        low, high = np.maximum(low, lens.field[0]), np.minimum(high, lens.field[1])
     return np.array(
         [
             [0.0, 0.0, 1.0, _NEAR_M],

@@ -55,7 +55,12 @@ def _lens_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
     """(h, w, 3) unit directions in the rectified axes of the eye, through every pixel or the grid of `_grid_px`."""
     camera = lens.camera
     u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
-    rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    try:
+        rays = lens.rays(pixels)
+    except ValueError:
+        # The lens folds between the border of the image and the grid's end.
+        rays = lens.rays(np.clip(pixels, -0.5, [camera.width_px - 0.5, camera.height_px - 0.5]))
     result: NDArray[np.float32] = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
     return result
 

@@ -239,7 +239,10 @@ def projection_faults(record: PairRecord) -> list[str]:
 
 
 def box_faults(record: PairRecord) -> list[str]:
-    """Centres of markers and hub that lie outside the drogue's full box."""
+    """Centres of markers and hub that lie outside the drogue's full box.
+
+    Through a lens only those on the image: the box and the centres of others may end with the lens's field.
+    """
     faults = []
     for eye in EYES:
         view = record.views.left if eye == "left" else record.views.right
@@ -250,6 +253,8 @@ def box_faults(record: PairRecord) -> list[str]:
         features = [*view.markers, *([view.hub] if view.hub is not None else [])]
         for index, feature in enumerate(features):
             point = np.array(feature.center_proj_px)
+            if record.frame.rig.lens(eye) is not None and not record.frame.rig.camera.contains(point):
+                continue
             if not ((point >= low) & (point <= high)).all():
                 name = f"markers[{index}]" if index < len(view.markers) else "hub"
                 faults.append(f"{eye}: {name}: center_proj_px {feature.center_proj_px} lies outside box_full_xywh_px")
@@ -260,7 +265,7 @@ def _point_faults(
     rig: StereoRig, pose: RigidTransform, points_m: Array, labelled: dict[Eye, Array], names: list[str]
 ) -> list[str]:
     """Faults of (N, 2) labels of both eyes against the images of (N, 3) points at a pose; N may be 0."""
-    faults, ideal = [], {}
+    faults, ideal, seen = [], {}, np.ones(len(points_m), dtype=np.bool_)
     if len(points_m) == 0 and not any(map(len, labelled.values())):
         return []
     for eye in EYES:
@@ -272,13 +277,18 @@ def _point_faults(
         offset = real_from_ideal @ (pose.translation_m - rig.eye_offset_m(eye))
         want, _ = cv2.projectPoints(points_m, turn, offset, lens.camera.matrix(), lens.distortion.coefficients())
         error = np.abs(labelled[eye] - want.reshape(-1, 2)).max(axis=1)
-        for index in np.flatnonzero(~(error <= ARITHMETIC_PX)):
+        in_field = rig.is_in_field(rig.project(pose.apply(points_m), eye), eye)
+        for index in np.flatnonzero(in_field & ~(error <= ARITHMETIC_PX)):
             faults.append(f"{eye}: {names[index]}: is {error[index]:.3g} px off the pose's image")
+        for index in np.flatnonzero(~in_field & rig.camera.contains(labelled[eye])):
+            faults.append(f"{eye}: {names[index]}: lies on the image, the lens does not see it")
+        seen &= in_field
+    for eye in EYES:
         try:
-            ideal[eye] = rig.ideal_px(labelled[eye], eye)
+            ideal[eye] = rig.ideal_px(labelled[eye][seen], eye)
         except ValueError:
             return [*faults, f"{eye}: labels lie where the lens sees nothing"]
-    gap = float(np.abs(ideal["left"][:, 1] - ideal["right"][:, 1]).max())
+    gap = float(np.abs(ideal["left"][:, 1] - ideal["right"][:, 1]).max(initial=0.0))
     if not gap <= _EPIPOLAR_TOLERANCE_PX:
         faults.append(f"rows of left and right differ by {gap:.3g} px once rectified")
     return faults

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from drogue_models.parts import Part
 from geometry.se3 import Array
 from geometry.stereo import Eye
 from render.analytic_engine.flat_drogue import FlatSurfaceLight
-from render.analytic_engine.pixel_coverage import pixel_coverage
+from render.analytic_engine.pixel_coverage import image_area, pixel_coverage
 from render.analytic_engine.ring_passes import PixelPasses, empty_passes
 from render.engine import EyeRadiance
 from scenes.environment_radiance import environment_radiance
@@ -63,19 +65,22 @@ def board_eye(frame: FrameSpec, placed: PlacedBoard, eye: Eye, background: NDArr
     return EyeRadiance(radiance_cd_m2=image, coverage=coverage, **vars(_passes(frame, placed, eye, plate is not None)))
 
 
-def _plate_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.Polygon:
+def _plate_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> Any:
     corners_m = placed.shape.outline_m()
     pieces = _pieces(frame, eye) * max(placed.shape.columns, placed.shape.rows)
     edge_m = _divided(corners_m, np.roll(corners_m, -1, axis=0), pieces).reshape(-1, 3)
-    return shapely.Polygon(frame.rig.image(placed.left_from_board.apply(edge_m), eye))
+    return image_area(frame.rig, eye, placed.left_from_board.apply(edge_m))
 
 
 def _black_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.MultiPolygon:
     """Every other square, starting at the lower corner; the squares touch only at the inner corners."""
     corners_m = _black_squares_m(placed.shape)
     edges_m = _divided(corners_m, np.roll(corners_m, -1, axis=1), _pieces(frame, eye))
-    edges_px = frame.rig.image(placed.left_from_board.apply(edges_m.reshape(-1, 3)), eye)
-    return shapely.MultiPolygon([shapely.Polygon(edge) for edge in edges_px.reshape(len(corners_m), -1, 2)])
+    areas = [
+        image_area(frame.rig, eye, placed.left_from_board.apply(edge_m))
+        for edge_m in edges_m.reshape(len(corners_m), -1, 3)
+    ]
+    return shapely.MultiPolygon([part for area in areas for part in shapely.get_parts(area) if not part.is_empty])
 
 
 def _black_squares_m(board: CalibrationBoard) -> Array:

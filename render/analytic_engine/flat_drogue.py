@@ -17,6 +17,7 @@ from drogue_models.solids import area_radius_m
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
+from render.analytic_engine.pixel_coverage import image_area
 from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
 from scenes.environment_radiance import EnvironmentRadiance
 
@@ -170,12 +171,12 @@ def _hidden_by(front: Any, area: Any) -> Any:
 
 
 def _ring_area(ring: FlatRing, view: EyeView) -> Any:
-    holes = [_outline_px(ring, ring.inner_radius_m, view)] if ring.inner_radius_m > 0 else None
-    return shapely.Polygon(_outline_px(ring, ring.outer_radius_m, view), holes)
+    hole_m = _outline_m(ring, ring.inner_radius_m, view) if ring.inner_radius_m > 0 else None
+    return image_area(view.rig, view.eye, _outline_m(ring, ring.outer_radius_m, view), hole_m)
 
 
-def _outline_px(ring: FlatRing, radius_m: float, view: EyeView) -> Array:
-    """(N, 2) corners of the image of a regular polygon with the disc's area. [px]
+def _outline_m(ring: FlatRing, radius_m: float, view: EyeView) -> Array:
+    """(N, 3) corners of a regular polygon with the disc's area, in the left camera. [m]
 
     A chord over one N-th of a circle of radius R deviates from it by `R pi^2 / (2 N^2)`, and by two thirds of that when
     the areas are equal.
@@ -185,5 +186,4 @@ def _outline_px(ring: FlatRing, radius_m: float, view: EyeView) -> Array:
         raise ValueError(f"left_from_drogue: all of the drogue must be in front of the camera, got {nearest_m:g} m")
     radius_px = max(view.rig.camera.fx_px, view.rig.camera.fy_px) * radius_m / nearest_m
     sides = max(int(np.ceil(np.pi * np.sqrt(radius_px / (3 * _OUTLINE_ERROR_PX)))), _FEWEST_SIDES)
-    corners_m = disc_outline(view.left_from_drogue, ring.center_m, area_radius_m(radius_m, sides), sides)
-    return view.rig.image(corners_m, view.eye)
+    return disc_outline(view.left_from_drogue, ring.center_m, area_radius_m(radius_m, sides), sides)

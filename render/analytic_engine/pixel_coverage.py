@@ -12,10 +12,33 @@ from numpy.typing import NDArray
 
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import Array
+from geometry.stereo import Eye, StereoRig
 
 # Sums of signed areas leave pixels that are wholly inside or outside within some 1e-12 of 1 or 0.
 _ROUNDING = 1e-9
 _NO_AREA = shapely.Polygon()
+# A strong lens bends an edge of this length by 3e-3 px (curvature 1e-4 / px), and these edges lie outside the image.
+_STRAIGHT_PX = 16.0
+
+
+def image_area(rig: StereoRig, eye: Eye, outline_m: Array, hole_m: Array | None = None) -> Any:
+    """The part of an eye's image inside an outline; what lies beyond the field of a lens is cut off.
+
+    Args:
+        rig, eye: which image.
+        outline_m: (N, 3) around the area, in the left camera frame, in front of the eye. [m]
+        hole_m: (M, 3) around a hole in it. [m]
+
+    Returns:
+        A shapely polygon, or several; empty where the lens sees nothing of the area. [px]
+    """
+    rings = [rig.project(ring, eye) for ring in (outline_m, *([] if hole_m is None else [hole_m]))]
+    if all(rig.is_in_field(ring, eye).all() for ring in rings):
+        outline_px, *holes_px = (rig.real_px(ring, eye) for ring in rings)
+        return shapely.Polygon(outline_px, holes_px)
+    field = shapely.box(*rig.field_px(eye).ravel())
+    inside = shapely.intersection(shapely.Polygon(rings[0], rings[1:]), field)
+    return shapely.transform(shapely.segmentize(inside, _STRAIGHT_PX), lambda ideal_px: rig.real_px(ideal_px, eye))
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,6 +147,50 @@ def test_every_pixel_of_an_accepted_lens_has_a_ray() -> None:
     assert accepted > 50
 
 
+def strong_rig(k1: float = -0.5) -> StereoRig:
+    """Small images of a lens that folds at 55 k1^-1/2 degrees from the axis, far outside of them."""
+    camera = PinholeCamera(320, 240, 533.0, 533.0, 159.5, 119.5)
+    lens = Lens(camera, BrownConrady(k1=k1))
+    turned = Lens(camera, BrownConrady(k1=k1), exp_twist([0, 0, 0, 0.01, -0.02, 0.03]).rotation)
+    return StereoRig(camera, 0.12, lenses=(lens, turned))
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_the_field_holds_the_image_and_nothing_that_folds_into_it(eye: Eye) -> None:
+    rig = strong_rig()
+    pixels = np.stack(np.meshgrid(np.linspace(-0.5, 319.5, 50), np.linspace(-0.5, 239.5, 40)), axis=-1)
+    assert rig.is_in_field(rig.ideal_px(pixels, eye), eye).all()
+    # Half a turn of places up to 80 degrees from the axis; those on the image by the polynomial alone are many.
+    angle, off_axis = np.meshgrid(np.linspace(0, 2 * np.pi, 100), np.radians(np.linspace(0, 80, 400)))
+    rays = np.stack([np.cos(angle) * np.tan(off_axis), np.sin(angle) * np.tan(off_axis), np.ones_like(angle)], axis=-1)
+    ideal = rig.camera.project(rays)
+    delivered, seen = rig.real_px(ideal, eye), rig.is_in_field(ideal, eye)
+    on_image = rig.camera.contains(delivered)
+    assert (on_image & ~seen).sum() > 100
+    np.testing.assert_allclose(rig.ideal_px(delivered[on_image & seen], eye), ideal[on_image & seen], atol=1e-8)
+
+
+@pytest.mark.parametrize("k1", [-0.5, -1.04, 0.5])
+@pytest.mark.parametrize("eye", EYES)
+def test_images_of_points_beyond_the_field_lie_outside_the_image_on_their_side(eye: Eye, k1: float) -> None:
+    """With k1 = -1.04 the lens folds right beyond the corners of the image."""
+    rig = strong_rig(k1)
+    points = np.random.default_rng(2).uniform([-5.0, -5.0, 1.0], [5.0, 5.0, 1.0], (2000, 3))
+    ideal = rig.project(points, eye)
+    beyond = ~rig.is_in_field(ideal, eye)
+    image = rig.image(points, eye)
+    assert beyond.sum() > 1000 and not rig.camera.contains(image[beyond]).any()
+    assert np.array_equal(image[~beyond], rig.real_px(ideal[~beyond], eye))
+    to_the_right = beyond & (ideal[:, 0] > 400) & (np.abs(ideal[:, 1] - 119.5) < 80)
+    assert to_the_right.sum() > 10 and (image[to_the_right, 0] > 319.5).all()
+
+
+def test_an_ideal_eye_has_no_end_of_its_field() -> None:
+    points = np.array([[50.0, -40.0, 1.0], [0.1, 0.2, 5.0]])
+    assert IDEAL.is_in_field(IDEAL.project(points, "left"), "left").all()
+    assert np.array_equal(IDEAL.image(points, "left"), IDEAL.project(points, "left"))
+
+
 # Of a wide-angle RGB-D camera, by orders of magnitude: rational with near-cancelling numerator and denominator.
 WIDE = OpenCvDistortion(0.52, -2.5, 4e-4, -3e-4, 1.5, k4=0.40, k5=-2.3, k6=1.4)
 PRISM = OpenCvDistortion(-0.1, 0.05, 2e-4, -1e-4, 0.01, 0.02, -0.01, 0.003, 1e-3, -5e-4, -8e-4, 3e-4)

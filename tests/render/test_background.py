@@ -4,7 +4,10 @@ import numpy as np
 
 from datasets_manifest.types.environment import CloudLayer
 from datasets_manifest.types.frame import FrameSpec
+from geometry.distortion import BrownConrady, Lens
+from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
+from geometry.stereo import StereoRig
 from render.background import add_stars, background
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
@@ -100,3 +103,17 @@ def test_stars_shine_with_all_their_light_and_stay_behind_clouds() -> None:
 def world_from_camera_up() -> np.ndarray:
     """Camera axes that look at the zenith."""
     return np.eye(3)
+
+
+def test_a_lens_that_folds_right_beyond_its_image_shows_the_sky_up_to_the_border() -> None:
+    camera = PinholeCamera(320, 240, 200.0, 200.0, 159.5, 119.5)
+    # It folds 2 px beyond the corners; the sky is interpolated between places up to 5 px beyond.
+    lens = Lens(camera, BrownConrady(k1=-0.145))
+    frame = sample_frame(paper_view_recipe(scale=0.25), 0)
+    mild, strong = (
+        background(frame.model_copy(update={"rig": StereoRig(camera, 0.12, lenses=(one, one))}))
+        for one in (Lens(camera, BrownConrady(k1=-0.144)), lens)
+    )
+    assert np.isfinite(strong).all()
+    # The sky's own change over a few pixels, and of the lens's by k1.
+    np.testing.assert_allclose(luminance(strong)[:4, :4], luminance(mild)[:4, :4], rtol=0.05)
