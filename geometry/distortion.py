@@ -245,8 +245,9 @@ class Lens:
         low, high = self.field
         inside = ((places >= low) & (places <= high)).all(axis=-1)
         # A corner of the field may lie beyond a fold.
-        inside[inside] = self._stretch(directions[inside]) > 0
-        return inside
+        near = _with_one(np.where(inside[..., None], places, 0.0))
+        seen: NDArray[np.bool_] = inside & (self._stretch(near) > 0)
+        return seen
 
     def into_field(self, rays: ArrayLike) -> Array:
         """(..., 3) rays in the rig's axes, z > 0; those beyond the field, moved to its edge, outside the image."""
@@ -259,6 +260,13 @@ class Lens:
         moved = directions.copy()
         moved[beyond, :2], moved[beyond, 2] = np.clip(places[beyond], low, high), 1.0
         return moved
+
+    def pixels_per_sr(self, rays: ArrayLike) -> Array:
+        """(...) density of the image's pixels over the solid angle around (..., 3) rays in the rig's axes. [1/sr]"""
+        directions = np.asarray(rays, dtype=np.float64)
+        along = directions @ self.ideal_from_real[:, 2] / np.linalg.norm(directions, axis=-1)
+        density: Array = self.camera.fx_px * self.camera.fy_px * self._stretch(directions) / along**3
+        return density
 
     def _in_rig(self, places: Array) -> Array:
         """(..., 3) directions in the rig's axes, scaled to z = 1, of (..., 2) ideal points at unit distance."""

@@ -45,13 +45,13 @@ def _directions(camera: PinholeCamera, rotation: NDArray[np.float64], u: NDArray
 
 
 def _lens_directions(lens: Lens, rotation: NDArray[np.float64], step_px: int) -> NDArray[np.float32]:
-    """The same through the pixels of an eye with a lens; `step_px` as in `_lens_rays`."""
-    directions: NDArray[np.float32] = np.einsum("ij,hwj->hwi", rotation.astype(np.float32), _lens_rays(lens, step_px))
+    """The same through the pixels of an eye with a lens; `step_px` as in `lens_rays`."""
+    directions: NDArray[np.float32] = np.einsum("ij,hwj->hwi", rotation.astype(np.float32), lens_rays(lens, step_px))
     return directions
 
 
 @lru_cache(maxsize=4)
-def _lens_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
+def lens_rays(lens: Lens, step_px: int = 1) -> NDArray[np.float32]:
     """(h, w, 3) unit directions in the rectified axes of the eye, through every pixel or the grid of `_grid_px`."""
     camera = lens.camera
     u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
@@ -156,18 +156,23 @@ def add_stars(sky: NDArray[np.float32], rig: StereoRig, eye: Eye, rotation: NDAr
         rig, eye: for the projection.
         rotation: (3, 3) `world_from_left`.
     """
-    camera = rig.camera
+    camera, lens = rig.camera, rig.lens(eye)
     directions, lux = star_catalogue()
     in_left = np.einsum("ni,ij->nj", directions, rotation)
-    widest = np.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
-    ahead = (in_left[:, 2] * widest > np.hypot(in_left[:, 0], in_left[:, 1])) & (directions[:, 2] > _LOWEST_SINE)
+    if lens is None:
+        widest = np.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
+        ahead = in_left[:, 2] * widest > np.hypot(in_left[:, 0], in_left[:, 1])
+    else:
+        ahead = in_left[:, 2] > 0
+        ahead[ahead] = lens.is_in_field(in_left[ahead])
+    ahead &= directions[:, 2] > _LOWEST_SINE
     rays, lux, up = in_left[ahead], lux[ahead], directions[ahead, 2]
     if len(rays) == 0:
         return
     lux = lux * 10.0 ** (-0.4 * EXTINCTION_MAG * (1.0 / up - 1.0))
     # Illuminance over the solid angle of the pixel.
-    level = lux * camera.fx_px * camera.fy_px / rays[:, 2] ** 3
-    center = rig.project(rays * _FAR_M, eye)
+    level = lux * camera.fx_px * camera.fy_px / rays[:, 2] ** 3 if lens is None else lux * lens.pixels_per_sr(rays)
+    center = rig.image(rays * _FAR_M, eye)
     corner = np.floor(center).astype(int)
     share = center - corner
     for du in (0, 1):

@@ -12,7 +12,7 @@ from datasets_manifest.types.frame import FrameSpec, Optics
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from render.background import background
+from render.background import background, lens_rays
 from render.camera.video_lens import add_bloom, ghosts, see_through, shift_colors
 from render.engine import EyeRadiance
 from scenes.environment_radiance import environment_radiance
@@ -53,9 +53,9 @@ def light_on_sensor(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np
         image = shift_colors(image, camera.lens, eye_camera)
     if camera is not None and camera.lens.bloom_fraction > 0:
         image = add_bloom(image, camera.lens.bloom_fraction, _BRIGHTEST_BLOOM * saturation_cd_m2(frame))
-    sun = _sun_on_lens(frame, seen)
+    sun = _sun_on_lens(frame, seen, eye)
     if sun is not None:
-        image = cv2.add(image, _sun_glare(frame, *sun))
+        image = cv2.add(image, _sun_glare(frame, eye, *sun))
         if camera is not None and camera.lens.ghost_fraction > 0:
             image = cv2.add(image, ghosts(camera.lens, eye_camera, *sun))
     optics = frame.sensor.optics
@@ -206,20 +206,21 @@ def glare_spread_per_sr(angle_rad: NDArray[np.float32], scattered_fraction: floa
     return spread
 
 
-def sun_glare(frame: FrameSpec, seen: EyeRadiance) -> NDArray[np.float32] | None:
+def sun_glare(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32] | None:
     """(H, W, 3) veiling glare of an eye by sun or moon in or near its view, or None without any. [cd/m2]
 
-    Parts in front of the disc reduce the glare; both eyes look along the same axes.
+    Parts in front of the disc reduce the glare.
 
     Args:
         frame: gives sun, camera and attitude at mid-exposure.
         seen: its coverage tells what hides the sun.
+        eye: which eye.
     """
-    sun = _sun_on_lens(frame, seen)
-    return None if sun is None else _sun_glare(frame, *sun)
+    sun = _sun_on_lens(frame, seen, eye)
+    return None if sun is None else _sun_glare(frame, eye, *sun)
 
 
-def _sun_on_lens(frame: FrameSpec, seen: EyeRadiance) -> tuple[Array, Array] | None:
+def _sun_on_lens(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> tuple[Array, Array] | None:
     """(3,) direction of sun or moon in the eye's axes, and (3,) illuminance of the lens by it [lux]; None without."""
     ambient = environment_radiance(frame.environment)
     illuminance_lux = ambient.beam_illuminance_lux
@@ -228,28 +229,33 @@ def _sun_on_lens(frame: FrameSpec, seen: EyeRadiance) -> tuple[Array, Array] | N
     if off_axis >= _HOOD_ENDS_RAD or illuminance_lux.max() < _DARKEST_LUX:
         return None
     shade = np.clip((_HOOD_ENDS_RAD - off_axis) / (_HOOD_ENDS_RAD - _HOOD_BEGINS_RAD), 0.0, 1.0)
-    falling = illuminance_lux * to_sun[2] * shade * _open_share(frame, seen, to_sun)
+    falling = illuminance_lux * to_sun[2] * shade * _open_share(frame, seen, eye, to_sun)
     if falling.max() < _DARKEST_LUX:
         return None
     return to_sun, falling
 
 
-def _sun_glare(frame: FrameSpec, to_sun: Array, falling: Array) -> NDArray[np.float32]:
-    camera = frame.rig.camera
-    x = ((np.arange(camera.width_px) - camera.cx_px) / camera.fx_px).astype(np.float32)
-    y = ((np.arange(camera.height_px) - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
-    sun = to_sun.astype(np.float32)
-    cosine = (x * sun[0] + y * sun[1] + sun[2]) / np.sqrt(1.0 + x * x + y * y)
+def _sun_glare(frame: FrameSpec, eye: Eye, to_sun: Array, falling: Array) -> NDArray[np.float32]:
+    camera, lens, sun = frame.rig.camera, frame.rig.lens(eye), to_sun.astype(np.float32)
+    if lens is None:
+        x = ((np.arange(camera.width_px) - camera.cx_px) / camera.fx_px).astype(np.float32)
+        y = ((np.arange(camera.height_px) - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
+        cosine = (x * sun[0] + y * sun[1] + sun[2]) / np.sqrt(1.0 + x * x + y * y)
+    else:
+        cosine = lens_rays(lens) @ sun
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     spread = glare_spread_per_sr(angle, frame.sensor.optics.scattered_fraction)
     veil: NDArray[np.float32] = spread[..., None] * falling.astype(np.float32)
     return veil
 
 
-def _open_share(frame: FrameSpec, seen: EyeRadiance, to_sun: NDArray[np.float64]) -> float:
+def _open_share(frame: FrameSpec, seen: EyeRadiance, eye: Eye, to_sun: NDArray[np.float64]) -> float:
     """Visible share of the disc; 1 for a sun outside the image."""
     camera = frame.rig.camera
-    center = camera.project(to_sun)
+    ideal = camera.project(to_sun)
+    if not frame.rig.is_in_field(ideal, eye):
+        return 1.0
+    center = frame.rig.real_px(ideal, eye)
     if not camera.contains(center):
         return 1.0
     radius_px = SUN_RADIUS_RAD * camera.fx_px

@@ -1,18 +1,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from datasets_manifest.types.environment import CloudLayer
 from datasets_manifest.types.frame import FrameSpec
 from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import RigidTransform
-from geometry.stereo import StereoRig
+from geometry.se3 import RigidTransform, exp_twist
+from geometry.stereo import EYES, Eye, StereoRig
 from render.background import add_stars, background
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
-from scenes.sky.sky_models import star_catalogue
+from scenes.sky.sky_models import EXTINCTION_MAG, star_catalogue
 from tests.support.recipe_builder import paper_view_recipe
 
 
@@ -63,6 +64,57 @@ def test_the_sun_is_drawn_where_it_stands() -> None:
     np.testing.assert_allclose([u.mean(), v.mean()], expected, atol=0.5)
     # 0.533 degrees of 37.2 px each, give or take a pixel's lattice.
     assert abs(np.sqrt(4 * disc.sum() / np.pi) - 0.5332 * np.pi / 180 * 2133.33) < 1.0
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_stars_stand_where_a_lens_shows_them_and_keep_their_light(eye: Eye) -> None:
+    camera, rotation = PinholeCamera(640, 480, 300.0, 300.0, 319.5, 239.5), world_from_camera_up()
+    lenses = tuple(
+        Lens(camera, BrownConrady(k1=-0.06, p1=1e-3), exp_twist([0, 0, 0, 0.01, -0.02, turn]).rotation)
+        for turn in (0.0, 0.02)
+    )
+    rig = StereoRig(camera, 0.12, lenses=lenses)
+    lens = rig.lens(eye)
+    stars = np.zeros((480, 640, 3), dtype=np.float32)
+    add_stars(stars, rig, eye, rotation)
+    corners_px = np.stack(np.meshgrid(np.arange(641) - 0.5, np.arange(481) - 0.5), axis=-1)
+    corners = lens.rays(corners_px)
+    # (H, W) solid angle of the pixels by their corners on the plane at z = 1, and the cube of their cosine.
+    across, other = corners[1:, 1:] - corners[:-1, :-1], corners[1:, :-1] - corners[:-1, 1:]
+    area = np.abs(across[..., 0] * other[..., 1] - across[..., 1] * other[..., 0]) / 2
+    middle = lens.rays(np.stack(np.meshgrid(np.arange(640), np.arange(480)), axis=-1))
+    light_lux = luminance(stars) * area / np.linalg.norm(middle, axis=-1) ** 3
+    directions, lux = star_catalogue()
+    in_left = directions @ rotation
+    # All of the image's, up to its corners 60 degrees off the axis; the polynomial folds at 67.
+    ahead = in_left[:, 2] > 0.4
+    air = 10.0 ** (-0.4 * EXTINCTION_MAG * (1.0 / directions[ahead, 2] - 1.0))
+    places, lux = lens.project_rays(in_left[ahead]), lux[ahead] * air
+    inside = camera.contains(places, 3.0)
+    # Each star shares its light among the four pixels around it, whose solid angles differ by less than 1 %.
+    found, wanted = np.zeros((2, 480, 640))
+    found += light_lux
+    for place, one in zip(places, lux, strict=True):
+        if camera.contains(place, 1.0):
+            (u, v), (right, down) = np.floor(place).astype(int), place - np.floor(place)
+            wanted[v : v + 2, u : u + 2] += one * np.outer([1 - down, down], [1 - right, right])
+    assert inside.sum() > 500
+    np.testing.assert_allclose(found[3:-3, 3:-3], wanted[3:-3, 3:-3], rtol=0.01, atol=1e-12)
+
+
+def test_stars_beyond_a_fold_are_not_seen() -> None:
+    camera, rotation = PinholeCamera(160, 120, 266.0, 266.0, 79.5, 59.5), world_from_camera_up()
+    lens = Lens(camera, BrownConrady(k1=-0.8))
+    rig = StereoRig(camera, 0.12, lenses=(lens, lens))
+    stars = np.zeros((120, 160, 3), dtype=np.float32)
+    add_stars(stars, rig, "left", rotation)
+    directions, _ = star_catalogue()
+    in_left = directions @ rotation
+    seen = in_left[in_left[:, 2] > 0.3]
+    seen = seen[rig.is_in_field(camera.project(seen), "left")]
+    count = camera.contains(lens.project_rays(seen), -1.0).sum()
+    # Each lights four pixels at most.
+    assert 0 < np.count_nonzero(luminance(stars)) <= 4 * count
 
 
 def test_stars_shine_with_all_their_light_and_stay_behind_clouds() -> None:
