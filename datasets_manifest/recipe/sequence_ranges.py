@@ -13,7 +13,8 @@ from datasets_manifest.types.environment import MIN_AIRSPEED_M_S, Turbulence
 from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import DropoutKind
 from drogue_models.frozen_model import FrozenModel
-from geometry.stereo import StereoRig
+from geometry.distortion import border_px
+from geometry.stereo import EYES, StereoRig
 
 
 class HoseParameters(FrozenModel):
@@ -165,7 +166,9 @@ class DropoutRanges(FrozenModel):
         """
         if "out-of-view" not in self.kinds:
             return
-        half_field_deg = math.degrees(math.atan((rig.camera.width_px / 2) / rig.camera.fx_px))
+        # A barrel lens sees more than the ideal image, most in its corners.
+        widest = max(float(abs(rig.rays(border_px(rig.camera), eye)[:, 0]).max()) for eye in EYES)
+        half_field_deg = math.degrees(math.atan(widest))
         beside_deg = math.degrees(math.atan((beside_m + rim_radius_m + rig.baseline_m) / distance_m))
         needed_deg = half_field_deg + beside_deg
         if self.turn_deg.low < needed_deg:

@@ -12,6 +12,7 @@ from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.recipe.sequence_ranges import DropoutRanges
 from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
 from geometry.stereo import EYES
@@ -19,7 +20,7 @@ from labelgen.part_pixels import drogue_hull_m
 from scenes.flight.dropouts import DropoutEvent, formation_displacement_m, sample_dropout
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import direction_from_angles
-from tests.support.recipe_builder import RIG_160_PX, RecipeTable, Section, build_recipe, change_recipe
+from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, RecipeTable, Section, build_recipe, change_recipe
 
 FRAMES = 40
 BASE: RecipeTable = {
@@ -285,6 +286,22 @@ def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset_right_m: list[
     with pytest.raises(ValueError, match=r"turn_deg: 28 degrees leave part .* at 6 m; turn by at least"):
         turned(28)
     turned(40)
+
+
+def test_a_turn_must_lose_the_drogue_behind_a_barrel_lens() -> None:
+    def turned(turn_deg: float, k1: float) -> Recipe:
+        rig = RIG_320_PX | {"focal_px": 200.0, "eyes": {"k1": k1}}
+        return recipe("out-of-view", rig=rig, sequence={"losses": {"turn_deg": turn_deg}})
+
+    turned(45, 0.0)
+    # The barrel sees 46 degrees aside in its corners instead of 38.7.
+    with pytest.raises(ValueError, match=r"turn_deg: 45 degrees leave part .* at 6 m; turn by at least 5"):
+        turned(45, -0.14)
+    drawn = turned(52, -0.14)
+    for k in lost(drawn):
+        frame = sample_frame(drawn, k)
+        points_m = frame.left_from_drogue.apply(marker_layout(frame.drogue).centers_m)
+        assert not any(frame.rig.camera.contains(frame.rig.image(points_m, eye)).any() for eye in EYES)
 
 
 def test_recipes_without_losses_do_not_know_of_them() -> None:
