@@ -261,6 +261,11 @@ class Lens:
         moved[beyond, :2], moved[beyond, 2] = np.clip(places[beyond], low, high), 1.0
         return moved
 
+    def largest_shift_px(self, ideal: PinholeCamera) -> float:
+        """Largest distance between a place of the image and that of an ideal camera with the same ray. [px]"""
+        ideal_px = ideal.project(self._in_rig(_undistorted_grid(self.camera, self.distortion)))
+        return float(np.linalg.norm(ideal_px - _grid_px(self.camera), axis=-1).max())
+
     def pixels_per_sr(self, rays: ArrayLike) -> Array:
         """(...) density of the image's pixels over the solid angle around (..., 3) rays in the rig's axes. [1/sr]"""
         directions = np.asarray(rays, dtype=np.float64)

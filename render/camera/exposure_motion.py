@@ -71,8 +71,9 @@ def image_window(
             break
         seen = camera.project(points)
         low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
-    # A lens shifts the image of an ideal eye by up to so much.
-    margin = _MARGIN_PX + np.ceil(rig.largest_shift_px())
+    # So far from its place in the ideal image a lens shows what it sees; a barrel also sees what is outside that image.
+    shift_px = max((lens.largest_shift_px(camera) for lens in rig.lenses or ()), default=0.0)
+    margin = _MARGIN_PX + np.ceil(shift_px)
     first = np.clip(np.floor(low) - margin, 0, size)
     end = np.clip(np.ceil(high) + margin + 1, 0, size)
     return None if (first >= end).any() else (first.astype(int), end.astype(int))

@@ -238,7 +238,9 @@ class CenterPasses:
             nearest_m = ends[..., 2].min(axis=1)
             narrow = (nearest_m > NEAREST_M) & (thickness_m * camera.fx_px < _NARROW_PX * nearest_m)
             if narrow.any():
-                ends_px = self._rig.real_px(camera.project(ends[narrow]), self._eye)
+                ideal_px = camera.project(ends[narrow])
+                seen = self._rig.is_in_field(ideal_px, self._eye).any(axis=-1)
+                ends_px = self._rig.real_px(ideal_px[seen], self._eye)
                 _draw_lines(np.ascontiguousarray(ends_px), int(surface.part_id), ids)
         return ids
 
