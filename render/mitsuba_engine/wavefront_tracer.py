@@ -161,7 +161,10 @@ def _near_lamps(frame: FrameSpec, scene: DrogueScene, rays: FrameRays, moves_px:
             points = eye_from_stage.apply(corners_m)
             if points[:, 2].min() < NEAREST_M:
                 continue
-            places = np.rint(frame.rig.real_px(camera.project(points), eye))
+            ideal_px = camera.project(points)
+            if not frame.rig.is_in_field(ideal_px, eye).any():
+                continue
+            places = np.rint(frame.rig.real_px(ideal_px, eye))
             (left, top), (right, bottom) = places.min(axis=0) - reach_px, places.max(axis=0) + reach_px + 1
             columns, rows = (max(int(low), 0) for low in (left, top))
             held[index, rows : max(int(bottom), 0), columns : max(int(right), 0)] = True

@@ -134,9 +134,9 @@ def test_a_fold_inside_the_image_is_refused(focal_px: float, k1: float, k2: floa
 
 def test_every_pixel_of_an_accepted_lens_has_a_ray() -> None:
     rng = np.random.default_rng(7)
-    pixels = np.stack(np.meshgrid(np.arange(0, 1280, 16.0), np.arange(0, 960, 16.0)), axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(0, 1280, 40.0), np.arange(0, 960, 40.0)), axis=-1)
     accepted = 0
-    for _ in range(400):
+    for _ in range(100):
         focal_px, k1, k2, k3 = rng.uniform([300.0, -2.0, -2.0, -2.0], [800.0, 2.0, 2.0, 2.0])
         try:
             lens = Lens(PinholeCamera(1280, 960, focal_px, focal_px, 639.5, 479.5), BrownConrady(k1=k1, k2=k2, k3=k3))
@@ -144,7 +144,7 @@ def test_every_pixel_of_an_accepted_lens_has_a_ray() -> None:
             continue
         accepted += 1
         np.testing.assert_allclose(lens.project_rays(lens.rays(pixels)), pixels, atol=1e-8)
-    assert accepted > 50
+    assert accepted > 20
 
 
 def strong_rig(k1: float = -0.5) -> StereoRig:
