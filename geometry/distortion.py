@@ -236,7 +236,8 @@ class Lens:
             if (self._stretch(_with_one(_SHARES * _edge_of(field))) > 0).all():
                 break
         field.flags.writeable = False
-        return field
+        bounds: Array = field
+        return bounds
 
     def is_in_field(self, rays: ArrayLike) -> NDArray[np.bool_]:
         """(...) whether (..., 3) rays in the rig's axes, z > 0, lie on the image, or in the margin around it."""
@@ -300,8 +301,8 @@ def _with_one(places: Array) -> Array:
 
 def _edge_of(field: Array) -> Array:
     """(M, 2) x and y around the edge of a field."""
-    grid = np.stack(np.meshgrid(*np.linspace(*field, _BORDER_POINTS).T), axis=-1)
-    return _outline(grid)
+    x, y = np.linspace(field[0], field[1], _BORDER_POINTS).T
+    return _outline(np.stack(np.meshgrid(x, y), axis=-1))
 
 
 def _outline(grid: Array) -> Array:
