@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
+import re
+import threading
 import warnings
+from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -21,10 +25,18 @@ IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tif
 _UPRIGHT: Final = 1
 # OpenCV applies the EXIF orientation of these; TIFF has the same number as a tag of its own.
 _TURNED_BY_OPENCV: Final = ("JPEG", "MPO", "PNG", "TIFF")
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
 # Only files that begin or hold these can have an orientation or pages; Pillow decodes a whole PNG to look for it.
 _TIFF_AND_WEBP: Final = (b"II", b"MM", b"RIFF")
 _ORIENTATION_MARKS: Final = (b"Exif", b"eXIf", b"exif", b"adobe.xmp", b"rientation")
+
+_STANDARD_ERROR: Final = 2
+_SILENT: Final = 0  # cv::utils::logging::LOG_LEVEL_SILENT
+_STANDARD_ERROR_LOCK: Final = threading.Lock()
+# libjpeg-turbo 3, jerror.h: warnings of wrong pixels, of which it writes the first alone, and of unusual headers.
+_DAMAGE: Final = rb"Corrupt JPEG data: |Premature end of JPEG file|Inconsistent progression sequence |libpng error: "
+_UNUSUAL: Final = rb"libpng warning: |Invalid SOS parameters |Unknown Adobe color transform |Warning: unknown JFIF "
+_DAMAGE_LINE: Final = re.compile(rb"^(?:%b)[^\n]*" % _DAMAGE, re.MULTILINE)
+_DECODER_LINE: Final = re.compile(rb"^(?:%b|%b)[^\n]*\n?" % (_DAMAGE, _UNUSUAL), re.MULTILINE)
 
 
 def read_image(path: Path) -> tuple[Pixels, bool]:
@@ -54,41 +66,52 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
         mirrored it.
 
     Raises:
-        ValueError: it cannot be decoded, has too many pixels, is not of 8 or 16 bits, has several pages, or an
-            orientation that OpenCV does not apply; names the image.
+        ValueError: it cannot be decoded, is damaged, has too many pixels, is not of 8 or 16 bits, has several pages, or
+            an orientation that OpenCV does not apply; names the image.
     """
     _check_size(data, name)
     orientation = _orientation(data, name)
     try:
-        with limited_memory(data.size):
-            shown = _without_color_profile(data)
-            image = cv2.imdecode(shown, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+        image, damage = _decoded(data)
     except (cv2.error, ValueError) as error:
         raise ValueError(f"{name}: cannot be read: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{name}: is truncated, or not an image of 8 or 16 bits")
+        raise ValueError(f"{name}: is truncated or damaged, or not an image of 8 or 16 bits")
+    if damage is not None:
+        raise ValueError(f"{name}: is damaged ({damage}); copy it anew, or save it again if it looks right")
     pixels = np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     return pixels, orientation != _UPRIGHT
 
 
-def _without_color_profile(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A PNG without its ICC profile, any other file as it is.
+def _decoded(data: NDArray[np.uint8]) -> tuple[Any, str | None]:
+    """The image in OpenCV's order, None where there is none, and what its decoder says of damage, None for nothing.
 
-    OpenCV does not apply the profile, and its PNG library writes warnings of common faults in it to the terminal.
+    libjpeg, libpng and OpenCV tell of faults on standard error alone, which belongs to the whole process: one decodes
+    at a time, and what else is written meanwhile is passed on.
 
-    Source: ISO/IEC 15948, Portable Network Graphics, 5.3 (chunks) and 5.6 (their order).
+    Raises:
+        ValueError: a lack of memory.
+        cv2.error: a fault that OpenCV raises.
     """
-    file = data.tobytes()
-    place = len(_PNG)
-    if not file.startswith(_PNG):
-        return data
-    # A profile comes before the pixels, so that most files are searched no farther than their first chunks.
-    while place + 8 <= len(file) and (kind := file[place + 4 : place + 8]) != b"IDAT":
-        end = place + 12 + int.from_bytes(file[place : place + 4], "big")
-        if kind == b"iCCP" and end <= len(file):
-            return np.frombuffer(file[:place] + file[end:], dtype=np.uint8)
-        place = end
-    return data
+    with _STANDARD_ERROR_LOCK, os.fdopen(os.memfd_create("decoder"), "w+b") as written:
+        shown = os.dup(_STANDARD_ERROR)
+        loudness = cv2.setLogLevel(_SILENT)
+        try:
+            os.dup2(written.fileno(), _STANDARD_ERROR)
+            with limited_memory(data.size):
+                image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+        finally:
+            os.dup2(shown, _STANDARD_ERROR)
+            os.close(shown)
+            cv2.setLogLevel(loudness)
+            written.seek(0)
+            said = written.read()
+            if others := _DECODER_LINE.sub(b"", said):
+                # Nobody may read it any more.
+                with suppress(OSError):
+                    os.write(_STANDARD_ERROR, others)
+    damage = _DAMAGE_LINE.search(said)
+    return image, None if damage is None else damage[0].decode("ascii", "replace")
 
 
 def _check_size(data: NDArray[np.uint8], name: str) -> None:

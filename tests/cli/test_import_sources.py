@@ -255,6 +255,18 @@ def test_recordings_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixt
     assert import_with(source / "bag") == DONE
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp"])
+def test_a_damaged_picture_is_told_in_one_line(suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    noise = np.random.default_rng(4).integers(256, size=(HEIGHT, WIDTH, 3), dtype=np.uint8)
+    source = save(tmp_path / "flight", f"left/1.{suffix}", f"right/1.{suffix}", values=noise)
+    path = source / f"left/1.{suffix}"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-2] + bytes(range(1, 9)) + whole[-2:] if suffix == "jpg" else whole[:-30])
+    assert import_with(source, *calibration(tmp_path)) == WRONG_INPUT
+    (line,) = capfd.readouterr().err.splitlines()
+    assert f"left/1.{suffix}: is " in line and "damaged" in line
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_raw_mosaics_are_kept(bits: int, tmp_path: Path) -> None:
     """FLIR's bayer_rggb8, and bayer_rggb16 with 12 bits in the upper part."""

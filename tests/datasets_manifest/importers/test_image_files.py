@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -92,20 +95,97 @@ def test_an_orientation_beyond_the_definition_is_upright() -> None:
     np.testing.assert_array_equal(decode_image_file(encoded(STORED, "PNG", 9), "a.png")[0], STORED)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "L"])
-def test_a_faulty_color_profile_is_no_matter_for_the_terminal(mode: str, capfd: pytest.CaptureFixture[str]) -> None:
-    pixels = np.random.default_rng(3).integers(256, size=(12, 16) if mode == "L" else (12, 16, 3), dtype=np.uint8)
+def profiled(pixels: np.ndarray, mode: str) -> np.ndarray:
     file = io.BytesIO()
     Image.fromarray(pixels, mode).save(file, "PNG", icc_profile=b"no profile" * 20)
-    data = np.frombuffer(file.getvalue(), np.uint8)
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+@pytest.mark.parametrize("is_checksum_wrong", [False, True])
+def test_a_faulty_color_profile_is_no_matter_for_the_terminal(
+    mode: str, is_checksum_wrong: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pixels = np.random.default_rng(3).integers(256, size=(12, 16) if mode == "L" else (12, 16, 3), dtype=np.uint8)
+    data = profiled(pixels, mode).copy()
+    if is_checksum_wrong:
+        data[data.tobytes().index(b"iCCP") + 20] ^= 1
     cv2.imdecode(data, cv2.IMREAD_ANYCOLOR)
-    assert "iCCP" in capfd.readouterr().err
+    assert "libpng warning: iCCP" in capfd.readouterr().err
     found, _ = decode_image_file(data, "picture")
     np.testing.assert_array_equal(found, pixels)
     assert capfd.readouterr() == ("", "")
     # A profile that is cut off leaves nothing to read.
     with pytest.raises(ValueError, match="picture: is truncated"):
         decode_image_file(data[:60], "picture")
+
+
+def flipped(data: np.ndarray, share: float) -> np.ndarray:
+    """The bytes of a file with one wrong, as by a fault of a disk."""
+    wrong = data.copy()
+    wrong[int(share * data.size)] ^= 0x5A
+    return wrong
+
+
+def landscape(seed: int) -> np.ndarray:
+    """(48, 64, 3) smooth colours, which JPEG codes by long runs."""
+    return cv2.resize(np.random.default_rng(seed).integers(0, 255, (6, 8, 3)).astype(np.uint8), (64, 48))
+
+
+def test_a_jpeg_that_its_decoder_calls_corrupt_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
+    whole = encoded(landscape(2), "JPEG")
+    for wrong in (flipped(whole, 0.6), np.concatenate([whole[:-2], np.full(9, 7, np.uint8), whole[-2:]])):
+        assert cv2.imdecode(wrong, cv2.IMREAD_COLOR) is not None
+        assert capfd.readouterr().err.startswith("Corrupt JPEG data: ")
+        with pytest.raises(ValueError, match=r"^a\.jpg: is damaged \(Corrupt JPEG data: .*\); copy it anew"):
+            decode_image_file(wrong, "a.jpg")
+        assert capfd.readouterr() == ("", "")
+    np.testing.assert_allclose(decode_image_file(whole, "a.jpg")[0].astype(int), landscape(2), atol=30)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP"])
+@pytest.mark.parametrize("fault", ["cut", "flipped"])
+def test_decoders_write_nothing_of_their_own(kind: str, fault: str, capfd: pytest.CaptureFixture[str]) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(landscape(2)).save(stream, kind)
+    data = np.frombuffer(stream.getvalue(), np.uint8)
+    # A flipped pixel of an uncompressed format cannot be noticed.
+    with suppress(ValueError):
+        decode_image_file(data[: int(0.6 * data.size)] if fault == "cut" else flipped(data, 0.75), "a.x")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_write_meanwhile_is_passed_on(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    decode = cv2.imdecode
+
+    def write_and_decode(*arguments: Any) -> Any:
+        os.write(2, b"half of the work is done\n")
+        return decode(*arguments)
+
+    whole = encoded(landscape(2), "JPEG")
+    monkeypatch.setattr(cv2, "imdecode", write_and_decode)
+    with pytest.raises(ValueError, match="is damaged"):
+        decode_image_file(flipped(whole, 0.6), "a.jpg")
+    assert capfd.readouterr() == ("", "half of the work is done\n")
+    decode_image_file(whole, "a.jpg")
+    assert capfd.readouterr() == ("", "half of the work is done\n")
+
+
+def test_damage_is_told_of_its_own_picture_in_many_threads(capfd: pytest.CaptureFixture[str]) -> None:
+    whole = encoded(landscape(2), "JPEG")
+
+    def is_whole(place: int) -> bool:
+        try:
+            decode_image_file(whole if place % 2 else flipped(whole, 0.6), "a.jpg")
+        except ValueError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(is_whole, range(40))) == [place % 2 == 1 for place in range(40)]
+    assert capfd.readouterr() == ("", "")
 
 
 def test_webp_is_read() -> None:
