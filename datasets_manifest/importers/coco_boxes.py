@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -178,8 +179,11 @@ class _NameIndex:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """The parts of a path; those of Windows and of Label Studio's local files (`...?d=left/1.png`) too."""
-    path = unquote(name.partition("?d=")[2]) if "?d=" in name else name
+    """The parts of a path; those of Windows and of Label Studio's local files (`...?d=left/1.png`) too.
+
+    Letters with accents are in one form of Unicode, as macOS writes another one than other systems.
+    """
+    path = unicodedata.normalize("NFC", unquote(name.partition("?d=")[2]) if "?d=" in name else name)
     return tuple(part for part in path.replace("\\", "/").split("/") if part not in ("", ".", "..")) or (name,)
 
 

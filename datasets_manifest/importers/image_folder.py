@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
@@ -85,27 +86,25 @@ def find_pairs(
         raise ValueError(f"{folder}: there is no such folder of images")
     views = _given_folders(folder, names) if names is not None else _view_folders(folder)
     if views is not None:
-        found = [{path: _rest_of_view(path.stem, eye) for path in images(view)} for eye, view in enumerate(views)]
+        found = [{path: _rest_of_view(_stem(path), eye) for path in images(view)} for eye, view in enumerate(views)]
         others = [path for path in images(folder) if folder not in views]
         where = " and ".join(str(view) for view in views)
     else:
-        sides = {path: _side(path.stem) for path in images(folder)}
+        sides = {path: _side(_stem(path)) for path in images(folder)}
         found = [{path: rest for path, (side, rest) in sides.items() if side == eye} for eye in range(len(EYES))]
         others = [path for path, (side, _) in sides.items() if side is None]
         where = str(folder)
     if not any(found):
         if views is not None or not others:
             raise ValueError(f"{where}: holds no images ({', '.join(IMAGE_SUFFIXES)}), nor left/ and right/ with them")
-        wide = [(path, path) for path in others]
-        return _with_times(wide, {path: path.stem for path in others}, rate_hz, [])
+        return _with_times([(path, path) for path in others], {path: _stem(path) for path in others}, rate_hz)
     for eye, view in zip(EYES, found, strict=True):
         if not view:
             raise ValueError(f"{where}: has no images of the {eye} view, and {sum(map(len, found))} of the other")
     pairs = _matched(where, (found[0], found[1]), tolerance_ns)
-    paired = {path for pair in pairs for path in pair}
-    alone = [f"{path}: has no partner" for view in found for path in sorted(view) if path not in paired]
-    alone += [f"{path}: is neither of the left nor of the right view" for path in others]
-    return _with_times(pairs, found[0], rate_hz, alone)
+    found_pairs = _with_times(pairs, {**found[0], **found[1]}, rate_hz)
+    beside = [f"{path}: is neither of the left nor of the right view" for path in others]
+    return replace(found_pairs, left_out=[*found_pairs.left_out, *beside])
 
 
 def has_images(folder: Path) -> bool:
@@ -114,11 +113,11 @@ def has_images(folder: Path) -> bool:
 
 
 def images(folder: Path) -> list[Path]:
-    """The image files in a folder, without those whose names begin with a dot, as macOS adds them."""
+    """The image files in a folder, whole or not, without those whose names begin with a dot, as macOS adds them."""
     return sorted(
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and not path.is_dir()
     )
 
 
@@ -221,6 +220,11 @@ def _image_folder(view: Path) -> Path:
     return below[0] if len(below) == 1 else view
 
 
+def _stem(path: Path) -> str:
+    """The name without its suffix; macOS writes letters with accents in another form of Unicode than other systems."""
+    return unicodedata.normalize("NFC", path.stem)
+
+
 def _rest_of_view(stem: str, eye: int) -> str:
     """The name of a file in the folder of a view, without the word that says the view."""
     side, rest = _side(stem)
@@ -242,23 +246,47 @@ def _in_number_order(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _with_times(
-    pairs: list[tuple[Path, Path]], rests: dict[Path, str], rate_hz: float | None, left_out: list[str]
-) -> FolderPairs:
-    """The pairs in the order of their times, where something says them, else in the order of their names."""
-    names = [rests[left] for left, _ in pairs]
+def _with_times(pairs: list[tuple[Path, Path]], rests: dict[Path, str], rate_hz: float | None) -> FolderPairs:
+    """The pairs in the order of their times, where something says them, else in the order of their names.
+
+    Args:
+        pairs: as their names say.
+        rests: of all files of the views: their names without the word that says the view. Without times each has its
+            place in the order, those without a partner too: a camera had lost their partners.
+        rate_hz: pairs per second, or None. [Hz]
+
+    Raises:
+        ValueError: no pair's files are there, or a list of times that does not fit.
+    """
+    faults = {path: fault for path in rests if (fault := _file_fault(path)) is not None}
+    whole = [pair for pair in pairs if faults.keys().isdisjoint(pair)]
+    if not whole:
+        path = next(path for path in pairs[0] if path in faults)
+        raise ValueError(f"{path}: {faults[path]}; no pair of these images is whole")
+    used = {path for pair in whole for path in pair}
+    left_out = [f"{path}: {faults.get(path, 'has no partner')}" for path in rests if path not in used]
     if rate_hz is None:
+        names = [rests[left] for left, _ in whole]
         times_ns, source = _stamps(names), "the time stamps in the names"
         if times_ns is None:
-            times_ns, source = _listed_times(pairs[0][0].parent, names)
+            times_ns, source = _listed_times(whole[0][0].parent, names)
         if times_ns is not None:
-            order = sorted(range(len(pairs)), key=times_ns.__getitem__)
+            order = sorted(range(len(whole)), key=times_ns.__getitem__)
             times_s = [1e-9 * times_ns[place] for place in order]
-            return FolderPairs([pairs[place] for place in order], times_s, source, left_out)
+            return FolderPairs([whole[place] for place in order], times_s, source, left_out)
         rate_hz = _RATE_HZ
-    ordered = sorted(pairs, key=lambda pair: _in_number_order(rests[pair[0]]))
-    times_s = [place / rate_hz for place in range(len(pairs))]
+    alone = rests.keys() - {path for pair in pairs for path in pair}
+    every = sorted([*pairs, *((path, path) for path in alone)], key=lambda pair: _in_number_order(rests[pair[0]]))
+    places = [place for place, pair in enumerate(every) if used.issuperset(pair)]
+    ordered, times_s = [every[place] for place in places], [place / rate_hz for place in places]
     return FolderPairs(ordered, times_s, f"{rate_hz:g} pairs a second (--rate)", left_out)
+
+
+def _file_fault(path: Path) -> str | None:
+    """Why an image cannot be read, or None for a regular file."""
+    if path.is_file():
+        return None
+    return "is no regular file" if path.exists() else "is a link to a file that is missing; fetch it"
 
 
 def _stamps(names: Iterable[str]) -> list[int] | None:

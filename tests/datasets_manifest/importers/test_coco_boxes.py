@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,14 @@ def test_a_name_that_fits_two_views_is_refused(name: str, tmp_path: Path) -> Non
         ValueError, match=r"boxes\.json: .*1\.png may be left/1\.png or right/1\.png; give each file_name"
     ):
         drawn.of_views([("left/1.png", "right/1.png")], VIEW)
+
+
+@pytest.mark.parametrize(("in_file", "on_disk"), [("NFC", "NFD"), ("NFD", "NFC")])
+@pytest.mark.parametrize("before", ["", "3f2a9c01-"])
+def test_names_in_another_form_of_unicode_are_found(in_file: Any, on_disk: Any, before: str, tmp_path: Path) -> None:
+    drawn = read_boxes(boxes(tmp_path, (unicodedata.normalize(in_file, f"{before}été_1.png"), [1, 2, 3, 4])))
+    names = [unicodedata.normalize(on_disk, name) for name in ("été_0.png", "été_1.png")]
+    assert drawn.of_images(names, [VIEW, VIEW]) == {1: ((0.5, 1.5, 3, 4),)}
 
 
 def test_a_whole_name_is_no_part_of_another(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
@@ -172,3 +174,76 @@ def test_lists_of_times_are_read(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"times\.txt: must list a time a line"):
             find_pairs(odometry)
     assert find_pairs(odometry, rate_hz=10.0).times_s == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("rate_hz", [None, 10.0])
+@pytest.mark.parametrize("layout", ["{eye}/{number:04d}.png", "{eye}_{number}.png"])
+def test_an_image_without_a_partner_keeps_its_place_in_time(layout: str, rate_hz: float | None, tmp_path: Path) -> None:
+    dropped = {"left": (3,), "right": range(5, 15)}
+    kept = [(eye, number) for eye in dropped for number in range(1, 21) if number not in dropped[eye]]
+    found = find_pairs(touch(tmp_path, *(layout.format(eye=eye, number=number) for eye, number in kept)), rate_hz)
+    want = [number for number in range(1, 21) if number not in (3, *range(5, 15))]
+    # Image 1 is the first.
+    assert found.times_s == pytest.approx([(number - 1) / (rate_hz or 25.0) for number in want])
+    assert len(found.left_out) == 11
+    assert not any(name in line for line in found.left_out for name in ("0001", "_1.png", "0020", "_20.png"))
+
+
+def test_places_count_pairs_of_near_stamps_once(tmp_path: Path) -> None:
+    touch(tmp_path, *(f"left/{ns}.png" for ns in STAMPS), *(f"right/{ns + 1_000_000}.png" for ns in STAMPS[::2]))
+    found = find_pairs(tmp_path, rate_hz=10.0, tolerance_ns=1_000_000)
+    assert found.times_s == pytest.approx([0.0, 0.2])
+
+
+def link(path: Path, target: str = "../../.git/annex/objects/1.png") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.symlink_to(target)
+
+
+@pytest.mark.parametrize("has_partner", [True, False])
+def test_links_whose_files_are_missing_are_told(has_partner: bool, tmp_path: Path) -> None:
+    """As git-annex and DVC leave them."""
+    touch(tmp_path, *(f"{eye}/{number}.png" for eye in ("left", "right") for number in (1, 3)))
+    link(tmp_path / "left/2.png")
+    if has_partner:
+        touch(tmp_path, "right/2.png")
+    else:
+        link(tmp_path / "right/2.png")
+    os.mkfifo(tmp_path / "right/4.png")
+    found = find_pairs(tmp_path, rate_hz=10.0)
+    assert [left.name for left, _ in found.pairs] == ["1.png", "3.png"]
+    assert found.times_s == pytest.approx([0.0, 0.2])
+    missing = "is a link to a file that is missing; fetch it"
+    assert list(found.left_out) == [
+        f"{tmp_path}/left/2.png: {missing}",
+        f"{tmp_path}/right/2.png: {'has no partner' if has_partner else missing}",
+        f"{tmp_path}/right/4.png: is no regular file",
+    ]
+
+
+@pytest.mark.parametrize("names", ["left/{}.png right/{}.png", "mav0/cam0/data/{}.png mav0/cam1/data/{}.png", "{}.png"])
+def test_a_folder_of_nothing_but_such_links_is_refused(names: str, tmp_path: Path) -> None:
+    for name in names.split():
+        for number in (1, 2):
+            link(tmp_path / name.format(number))
+    with pytest.raises(ValueError, match=r"1\.png: is a link to a file that is missing; fetch it; no pair .* whole"):
+        find_pairs(tmp_path)
+
+
+def test_links_to_images_are_images(tmp_path: Path) -> None:
+    touch(tmp_path, "store/a", "store/b")
+    link(tmp_path / "flight/left/1.png", str(tmp_path / "store/a"))
+    link(tmp_path / "flight/right/1.png", str(tmp_path / "store/b"))
+    assert names_of(tmp_path / "flight") == [("left/1.png", "right/1.png")]
+
+
+@pytest.mark.parametrize("layout", ["{eye}/{name}.png", "{eye}_{name}.png"])
+@pytest.mark.parametrize("tail", ["", "é"])
+def test_names_in_two_forms_of_unicode_are_a_pair(layout: str, tail: str, tmp_path: Path) -> None:
+    """A folder of macOS beside one of Linux; the letter may be the first or the last too."""
+    forms = {"left": "NFD", "right": "NFC"}
+    names = [
+        layout.format(eye=eye, name=unicodedata.normalize(form, f"é vol{tail} 7"))  # type: ignore[arg-type]
+        for eye, form in forms.items()
+    ]
+    assert names_of(touch(tmp_path, *names)) == [tuple(names)]
