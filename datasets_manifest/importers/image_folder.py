@@ -158,11 +158,25 @@ def _by_key(views: tuple[dict[Path, str], dict[Path, str]]) -> tuple[dict[str, P
 
 
 def _given_folders(folder: Path, names: tuple[str, str]) -> tuple[Path, Path]:
-    found = [folder / name for name in names]
-    for path in found:
-        if not path.is_dir():
-            raise ValueError(f"--folders: {path} is not a folder")
-    return _image_folder(found[0]), _image_folder(found[1])
+    first, second = (_given_folder(folder, name) for name in names)
+    return _image_folder(first), _image_folder(second)
+
+
+def _given_folder(folder: Path, name: str) -> Path:
+    """A folder in the source, whether its name is absolute or not; a link in the source may lead out of it.
+
+    Raises:
+        ValueError: there is no such folder, or it lies elsewhere.
+    """
+    path = folder / name
+    if not path.is_dir():
+        raise ValueError(f"--folders: {path} is not a folder")
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        top, place = folder.resolve(), path.resolve()
+        if not place.is_relative_to(top):
+            raise ValueError(f"--folders: must lie in {folder}, got {name}")
+        return folder / place.relative_to(top)
+    return path
 
 
 def _view_folders(folder: Path, depth: int = 0) -> tuple[Path, Path] | None:

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from droguekit.batch.progress import ProgressReport
 
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+_ROS2_SUFFIXES = {".mcap", ".db3"}
+# The key of all that rosbag2 writes into metadata.yaml, which begins with it.
+_METADATA_KEY, _METADATA_BEGIN_BYTES = b"rosbag2_bagfile_information", 2**16
 _IMAGE_SIZE = re.compile("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
@@ -207,12 +210,12 @@ def _bag_path(source: Path) -> Path | None:
             f"{source}: must be a folder of images, or a ROS bag: a folder with metadata.yaml, or a .bag, .mcap or "
             ".db3 file"
         )
-    if (source / "metadata.yaml").is_file():
+    if _is_bag_folder(source):
         return source
     from datasets_manifest.importers.image_folder import has_images
 
     visible = sorted(path for path in source.iterdir() if not path.name.startswith("."))
-    bags = [path for path in visible if path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file()]
+    bags = [path for path in visible if path.suffix.lower() in _BAG_SUFFIXES or _is_bag_folder(path)]
     if not bags:
         return None
     if len(bags) > 1:
@@ -220,3 +223,21 @@ def _bag_path(source: Path) -> Path | None:
     if has_images(source):
         raise ValueError(f"{source}: holds images and the bag {bags[0]}; name the bag, or move it elsewhere")
     return bags[0]
+
+
+def _is_bag_folder(folder: Path) -> bool:
+    """Whether a folder is a bag of ROS 2: other programs write a metadata.yaml too, without its key or a recording.
+
+    Raises:
+        OSError: the metadata cannot be read.
+    """
+    metadata = folder / "metadata.yaml"
+    if not metadata.is_file():
+        return False
+    # `ros2 bag record --compression-mode file` adds the suffix of the compression.
+    if any(not _ROS2_SUFFIXES.isdisjoint(path.suffixes) for path in folder.iterdir()):
+        return True
+    from drogue_models.untrusted_files import open_regular
+
+    with open_regular(metadata) as stream:
+        return _METADATA_KEY in stream.read(_METADATA_BEGIN_BYTES)

@@ -255,6 +255,27 @@ def test_recordings_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixt
     assert import_with(source / "bag") == DONE
 
 
+@pytest.mark.parametrize("place", ["", "left"])
+def test_metadata_of_other_programs_makes_no_bag(place: str, tmp_path: Path) -> None:
+    source = save(tmp_path / "flight", "left/1.png", "right/1.png")
+    (source / place / "metadata.yaml").write_text("camera: left and right\nexposure_ms: 2\n")
+    assert import_with(source, *calibration(tmp_path)) == DONE
+    assert times_s(source) == [0.0]
+
+
+def test_metadata_or_recordings_make_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bag is one though its metadata is damaged, or its recording is missing."""
+    bag = write_bag2(tmp_path / "bag", stereo((1,)))
+    (recording,) = bag.glob("*.mcap")
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text("damaged: true\n")
+    assert import_with(bag) == WRONG_INPUT and "bag" in capsys.readouterr().err
+    (bag / "metadata.yaml").write_text(text)
+    recording.unlink()
+    assert import_with(bag) == WRONG_INPUT
+    assert "holds no images" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "png", "bmp"])
 def test_a_damaged_picture_is_told_in_one_line(suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     noise = np.random.default_rng(4).integers(256, size=(HEIGHT, WIDTH, 3), dtype=np.uint8)

@@ -108,6 +108,20 @@ def test_folders_can_be_named(tmp_path: Path) -> None:
         find_pairs(tmp_path, names=("22001", "22003"))
 
 
+def test_named_folders_must_lie_in_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, *(f"{name}/{eye}/5.png" for name in ("flight", "other") for eye in ("a", "b")))
+    monkeypatch.chdir(tmp_path)
+    source, other = Path("flight"), tmp_path / "other"
+    for names in ((str(tmp_path / "flight/a"), str(tmp_path / "flight/b")), ("a/../a", "../flight/b"), ("a", "./b")):
+        assert names_of(source, names=names) == [("a/5.png", "b/5.png")]
+    for name in (str(other / "b"), "../other/b", "a/../../other/b"):
+        with pytest.raises(ValueError, match=rf"^--folders: must lie in flight, got {name}$"):
+            find_pairs(source, names=("a", name))
+    # A recording of links to folders is one.
+    (source / "c").symlink_to(other / "a")
+    assert names_of(source, names=("c", "b")) == [("c/5.png", "b/5.png")]
+
+
 def test_files_beside_the_pairs_are_told(tmp_path: Path) -> None:
     touch(tmp_path, "left_1.png", "right_1.png", "overview.png")
     assert find_pairs(tmp_path).left_out == [f"{tmp_path}/overview.png: is neither of the left nor of the right view"]
