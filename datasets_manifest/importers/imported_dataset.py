@@ -136,7 +136,7 @@ def write_imported(
 
     Raises:
         ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair; pairs
-            that are not in the order of time; or settings that contradict what the source says.
+            that are not in the order of time, or before 0; or settings that contradict what the source says.
         OSError: it cannot be written; nothing is left behind.
     """
     depth: PixelDepth | None = None
@@ -146,6 +146,10 @@ def write_imported(
     box_count = 0
     with new_folder(out) as folder:
         for frame_index, pair in enumerate(source):
+            if pair.time_s < 0:
+                raise ValueError(
+                    f"{pair.names[0]}: its time must be at least 0, got {pair.time_s} s; shift the times of the source"
+                )
             if not pair.time_s > time_s:
                 raise ValueError(f"{pair.names[0]}: its time of {pair.time_s} s must be later than the pair's before")
             meant, encoding = _as_said(settings, pair), meant.encoding

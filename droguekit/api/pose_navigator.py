@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from scenes.sampler import FRAME_PERIOD_S
 
 # Of 12 bits.
 _MOST_DN = 4095
+_MOST_DN_OF_8_BITS = 255
 
 
 class Navigator:
@@ -89,8 +91,15 @@ class Navigator:
             A `PoseEstimate`, or a `NoFix` with the reason.
 
         Raises:
-            ValueError: arrays of another type, of different shapes, or with more than 12 bits.
+            ValueError: arrays of another type, of different shapes, or with more than 12 bits, a black level beyond
+                their largest number, or a time that is no finite number.
         """
+        if time_s is not None and not math.isfinite(time_s):
+            raise ValueError(f"time_s: must be a finite number, got {time_s}")
+        if left.dtype == "uint8" and self._black_level_dn > _MOST_DN_OF_8_BITS:
+            raise ValueError(
+                f"black_level_dn: must be from 0 to {_MOST_DN_OF_8_BITS} for uint8 images, got {self._black_level_dn}"
+            )
         most_dn = max((int(each.max()) for each in (left, right) if each.dtype == "uint16"), default=0)
         if most_dn > _MOST_DN:
             raise ValueError(f"images: must have 12 significant bits in the low end of uint16, got the value {most_dn}")

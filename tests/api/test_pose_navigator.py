@@ -66,6 +66,28 @@ def test_images_of_16_bits_are_refused(smoke_dataset: Path) -> None:
         droguekit.Navigator(dataset.rig, dataset.drogue)(deep, deep)
 
 
+@pytest.mark.parametrize("tracker", [None, "bernoulli"])
+@pytest.mark.parametrize("time_s", [float("nan"), float("inf"), -float("inf")])
+def test_a_time_that_is_no_number_is_refused(time_s: float, tracker: str | None, smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    empty = np.full_like(dataset[0].left, 90)
+    navigator = droguekit.Navigator(dataset.rig, dataset.drogue, tracker=tracker)
+    with pytest.raises(ValueError, match=f"^time_s: must be a finite number, got {time_s}$"):
+        navigator(empty, empty, time_s=time_s)
+    # The pair does not count.
+    assert navigator(empty, empty, time_s=1.0).frame_index == 0
+
+
+def test_a_black_level_that_8_bits_do_not_reach_is_refused(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    navigator = droguekit.Navigator(dataset.rig, dataset.drogue, black_level_dn=300)
+    shape = dataset[0].left.shape
+    with pytest.raises(ValueError, match=r"^black_level_dn: must be from 0 to 255 for uint8 images, got 300$"):
+        navigator(np.full(shape, 90, np.uint8), np.full(shape, 90, np.uint8))
+    deep = np.full(shape, 900, np.uint16)
+    assert navigator(deep, deep).frame_index == 0
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

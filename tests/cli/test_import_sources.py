@@ -255,6 +255,16 @@ def test_recordings_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixt
     assert import_with(source / "bag") == DONE
 
 
+def test_times_before_zero_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = save(tmp_path / "flight", *(f"{eye}/{number}.png" for eye in ("left", "right") for number in (0, 1)))
+    (source / "times.txt").write_text("-5.0\n0.1\n")
+    assert import_with(source, *calibration(tmp_path)) == WRONG_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "left/0.png: its time must be at least 0, got -5.0 s" in line
+    (source / "times.txt").write_text("0.0\n0.1\n")
+    assert import_with(source, *calibration(tmp_path)) == DONE
+
+
 @pytest.mark.parametrize("place", ["", "left"])
 def test_metadata_of_other_programs_makes_no_bag(place: str, tmp_path: Path) -> None:
     source = save(tmp_path / "flight", "left/1.png", "right/1.png")

@@ -194,9 +194,9 @@ def _stamped(order: SequenceOrder, records: Iterator[PairRecord]) -> Iterator[tu
 
 
 def _line(pose: RigidTransform, stamp_ns: int) -> str:
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    seconds, nanoseconds = divmod(abs(stamp_ns), 10**9)
     numbers = [*pose.translation_m.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist()]
-    return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(number) for number in numbers) + "\n"
+    return f"{'-' * (stamp_ns < 0)}{seconds}.{nanoseconds:09d} " + " ".join(repr(number) for number in numbers) + "\n"
 
 
 def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates: Path) -> list[str]:
@@ -246,10 +246,11 @@ def _places(dataset: Location, log: ExportLog, has_truth: bool) -> Iterator[tupl
         for record in log.records(Dataset(dataset), with_files=False):
             yield record.frame_index, order.stamp_ns(record), sequence_name(record.sequence_id), record
         return
-    frames, last_ns = FrameStore(dataset), -1
+    frames = FrameStore(dataset)
+    last_ns: int | None = None
     for frame_index in read_blind_index(dataset).frames:
         stamp_ns = round(read_shutter(frames, frame_index).time_s * 1e9)
-        if stamp_ns <= last_ns:
+        if last_ns is not None and stamp_ns <= last_ns:
             raise ValueError(f"frame {frame_index}: time_s: must be later than the pair's before it")
         last_ns = stamp_ns
         yield frame_index, stamp_ns, sequence_name(None), None

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from datasets_manifest.storage.layout import RECORD_FILE
 from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
+from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, read_estimates, write_estimates
 from geometry.se3 import RigidTransform
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
@@ -115,6 +116,19 @@ def test_estimates_of_a_damaged_pair_are_left_out_with_it(dataset: Path, tmp_pat
     for name in ("truth", "exact"):
         whole, rest = (numbers(tmp_path / out / name / "single_pairs.txt") for out in ("whole", "out"))
         np.testing.assert_array_equal(rest, whole[:-1])
+
+
+def test_times_before_zero_are_written_as_they_are(dataset: Path, tmp_path: Path) -> None:
+    write_export("blind", dataset, tmp_path / "blind", ExportLog())
+    for path in (tmp_path / "blind" / "frames").glob("*/" + RECORD_FILE):
+        table = json.loads(path.read_text())
+        path.write_text(json.dumps(table | {"time_s": 0.25 * int(path.parent.name) - 1.75}))
+    estimates = estimates_of(dataset, tmp_path / "estimates.jsonl")
+    _, exact = write_export("tum", tmp_path / "blind", tmp_path / "out", ExportLog(), estimates=estimates)
+    fixes = [fix.frame_index for fix in read_estimates(estimates) if fix.method == "exact"]
+    want = [0.25 * index - 1.75 for index in fixes]
+    assert min(want) < -1
+    np.testing.assert_array_equal(numbers(exact / "single_pairs.txt")[:, 0], want)
 
 
 @pytest.mark.parametrize(
