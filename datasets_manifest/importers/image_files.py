@@ -32,9 +32,16 @@ _ORIENTATION_MARKS: Final = (b"Exif", b"eXIf", b"exif", b"adobe.xmp", b"rientati
 _STANDARD_ERROR: Final = 2
 _SILENT: Final = 0  # cv::utils::logging::LOG_LEVEL_SILENT
 _STANDARD_ERROR_LOCK: Final = threading.Lock()
-# libjpeg-turbo 3, jerror.h: warnings of wrong pixels, of which it writes the first alone, and of unusual headers.
-_DAMAGE: Final = rb"Corrupt JPEG data: |Premature end of JPEG file|Inconsistent progression sequence |libpng error: "
-_UNUSUAL: Final = rb"libpng warning: |Invalid SOS parameters |Unknown Adobe color transform |Warning: unknown JFIF "
+# Webcams put up to some ten bytes behind the last block of pixels, before the end of the image.
+_FILLED: Final = rb"1?\d extraneous bytes before marker 0xd9"
+# libjpeg-turbo 3, jerror.h: warnings of wrong pixels, of which it writes the first alone, and of unusual files.
+_DAMAGE: Final = (
+    rb"Corrupt JPEG data: (?!%b)|Premature end of JPEG file|Inconsistent progression sequence |libpng error: " % _FILLED
+)
+_UNUSUAL: Final = (
+    rb"Corrupt JPEG data: %b|libpng warning: |Invalid SOS parameters |Unknown Adobe color transform |"
+    rb"Warning: unknown JFIF " % _FILLED
+)
 _DAMAGE_LINE: Final = re.compile(rb"^(?:%b)[^\n]*" % _DAMAGE, re.MULTILINE)
 _DECODER_LINE: Final = re.compile(rb"^(?:%b|%b)[^\n]*\n?" % (_DAMAGE, _UNUSUAL), re.MULTILINE)
 

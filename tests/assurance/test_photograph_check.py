@@ -89,7 +89,7 @@ def test_hits_misses_and_false_alarms(photographs: Path, rendered: Path, tmp_pat
     assert len(found.judged) == 4 and found.fault is not None and "broken.jpg" in found.fault
     assert "3 of 3 drogues found, 0 missed, 0 false alarms" in "\n".join(check_lines(found))
 
-    boxes.write_text(json.dumps(drawn(rendered, shift_px=200.0)))
+    boxes.write_text(json.dumps(drawn(rendered, shift_px=100.0)))
     wrong = checked(photographs, boxes)
     assert sum(one.hits for one in wrong.photographs) == 0 and wrong.ap50 == 0.0
     assert sum(one.misses for one in wrong.photographs) == 3

@@ -132,15 +132,24 @@ def landscape(seed: int) -> np.ndarray:
     return cv2.resize(np.random.default_rng(seed).integers(0, 255, (6, 8, 3)).astype(np.uint8), (64, 48))
 
 
+def filled(data: np.ndarray, count: int) -> np.ndarray:
+    """A JPEG with so many bytes behind its pixels."""
+    return np.concatenate([data[:-2], np.full(count, 7, np.uint8), data[-2:]])
+
+
 def test_a_jpeg_that_its_decoder_calls_corrupt_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     whole = encoded(landscape(2), "JPEG")
-    for wrong in (flipped(whole, 0.6), np.concatenate([whole[:-2], np.full(9, 7, np.uint8), whole[-2:]])):
+    for wrong in (flipped(whole, 0.6), filled(whole, 40)):
         assert cv2.imdecode(wrong, cv2.IMREAD_COLOR) is not None
         assert capfd.readouterr().err.startswith("Corrupt JPEG data: ")
         with pytest.raises(ValueError, match=r"^a\.jpg: is damaged \(Corrupt JPEG data: .*\); copy it anew"):
             decode_image_file(wrong, "a.jpg")
         assert capfd.readouterr() == ("", "")
-    np.testing.assert_allclose(decode_image_file(whole, "a.jpg")[0].astype(int), landscape(2), atol=30)
+    pixels, _ = decode_image_file(whole, "a.jpg")
+    np.testing.assert_allclose(pixels.astype(int), landscape(2), atol=30)
+    # As webcams write them.
+    np.testing.assert_array_equal(decode_image_file(filled(whole, 9), "a.jpg")[0], pixels)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP"])
