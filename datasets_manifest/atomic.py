@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -20,6 +21,7 @@ PART_SUFFIX = ".part"
 """Suffix of everything that is still being written; such names also begin with a dot."""
 
 
+_UNWRITABLE = ": cannot be written: "
 _OPEN_FILES = re.compile(r"/proc/(\d+)/fd")
 # As many links behind each other as Linux follows.
 _MOST_LINKS = 40
@@ -129,10 +131,10 @@ def _parents_made(path: Path) -> Iterator[None]:
 
 
 def _unwritable(path: Path, error: OSError) -> OSError:
-    """The error that a path cannot be written; of errors within errors the innermost one has the reason."""
-    while isinstance(error.__cause__, OSError):
+    """The error that a path cannot be written; that of a path below it is told by its reason alone."""
+    while isinstance(error.__cause__, OSError) and _UNWRITABLE in str(error):
         error = error.__cause__
-    return OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}")
+    return OSError(error.errno, f"{path}{_UNWRITABLE}{error.strerror or error}")
 
 
 def _sync(stream: IO[Any]) -> None:
@@ -179,7 +181,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     A folder that exists stays, with its rights, as a mounted one must; it gets the contents at the end.
 
     Args:
-        out: must not exist yet, or be empty but for what a killed process left.
+        out: must not exist yet, or be empty.
 
     Raises:
         ValueError: it exists and is not empty.
@@ -187,7 +189,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     """
     target = out.resolve()
     is_there = target.exists()
-    if is_there and not (target.is_dir() and all(child.name.endswith(PART_SUFFIX) for child in target.iterdir())):
+    if is_there and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{out}: is not empty; name a new folder, or delete this one")
     part = part_path(target / "new" if is_there else target)
     try:
@@ -209,8 +211,12 @@ def new_folder(out: Path) -> Iterator[Path]:
 def _move_contents(source: Path, target: Path) -> None:
     """Move all that is in a folder into another one, or nothing; files last, as they tell that all is there."""
     moved: list[Path] = []
+    children = sorted(source.iterdir(), key=lambda child: (child.is_file(), child.name))
+    for child in children:
+        if (target / child.name).exists():
+            raise FileExistsError(errno.EEXIST, f"another process wrote {child.name} into it")
     try:
-        for child in sorted(source.iterdir(), key=lambda child: (child.is_file(), child.name)):
+        for child in children:
             moved.append(child.rename(target / child.name))
     except BaseException:
         for path in moved:

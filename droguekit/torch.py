@@ -60,7 +60,7 @@ def sample_of_pair(pair: StereoPair, with_truth: bool = True, keypoints: int | N
         keypoints: M, at least the number of the drogue's markers, which it is by default.
 
     Raises:
-        ValueError: a file is missing or damaged; names it.
+        ValueError: a file is missing or damaged, or fewer keypoints than markers; names it.
     """
     sample = {
         "left": _image_tensor(pair.left),
@@ -71,7 +71,10 @@ def sample_of_pair(pair: StereoPair, with_truth: bool = True, keypoints: int | N
     if with_truth:
         pose = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.as_matrix()
         views = (pair.record.views.left, pair.record.views.right)
-        count = marker_layout(pair.drogue).count if keypoints is None else keypoints
+        markers = marker_layout(pair.drogue).count
+        count = markers if keypoints is None else keypoints
+        if count < markers:
+            raise ValueError(f"keypoints: {pair.drogue.name} has {markers} markers, got {count}")
         sample["left_from_drogue"] = torch.from_numpy(pose)
         sample["boxes_px"] = torch.from_numpy(np.stack([_box_px(view) for view in views]))
         sample["keypoints_px"] = torch.from_numpy(np.stack([_keypoints_px(view, count) for view in views]))

@@ -19,6 +19,8 @@ _MAX_STEPS = 60
 _TOLERANCE = 1e-13
 # Near enough for Newton's method to go on without care; closer to the solution rounding moves the error up and down.
 _NEARLY = 1e-9
+# Shares of the way from the axis to a solution, on which no fold may lie; and steps of that way where one does.
+_WAY, _FOLLOWED_STEPS = (0.25, 0.5, 0.75), 64
 _BORDER_POINTS = 32
 # The field reaches beyond the image by so many times its width and height, the first with which the lens does not fold.
 _FIELD_MARGINS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.025, 0.0125, 0.0)
@@ -64,28 +66,47 @@ class BrownConrady:
         wanted = np.asarray(places, dtype=np.float64)
         # Steps go from `last` along `step`: the first from the axis, where no lens folds, to the distorted points.
         last, step = np.zeros_like(wanted), wanted.copy()
-        last_size = np.full(wanted.shape[:-1], np.inf)
+        last_size = np.abs(wanted).max(axis=-1, initial=0.0)
         for _ in range(_MAX_STEPS):
             ideal = last + step
             seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
             error = wanted - seen
             size = np.abs(error).max(axis=-1, initial=0.0)
             if size.max(initial=0.0) < _TOLERANCE:
+                # A first step across two folds may have come to another branch of the polynomial.
+                ways = (self.stretch(share * ideal) > 0 for share in _WAY)
+                strayed = np.logical_or((ideal * wanted).sum(axis=-1) < 0, ~np.logical_and.reduce(list(ways)))
+                if strayed.any():
+                    ideal[strayed] = self._followed_from_axis(wanted[strayed])
                 return ideal
             determinant = j_xx * j_yy - j_xy * j_yx
             good = (determinant > 0) & ((size < last_size) | (size < _NEARLY))
-            determinant = np.where(good, determinant, 1.0)
-            newton = np.stack(
-                [
-                    (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant,
-                    (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant,
-                ],
-                axis=-1,
-            )
+            newton = _newton_step(error, j_xx, j_xy, j_yx, j_yy, np.where(good, determinant, 1.0))
             # A step across a fold, or one that leads away, is halved.
             last, step = np.where(good[..., None], ideal, last), np.where(good[..., None], newton, step / 2)
             last_size = np.where(good, size, last_size)
-        raise self.folds()
+        raise self.fold_error()
+
+    def _followed_from_axis(self, wanted: Array) -> Array:
+        """(N, 2) ideal points of (N, 2) distorted ones, followed from the axis in small steps.
+
+        Raises:
+            ValueError: the way meets a fold.
+        """
+        ideal = np.zeros_like(wanted)
+        for share in np.linspace(0.0, 1.0, _FOLLOWED_STEPS + 1)[1:]:
+            for _ in range(_MAX_STEPS):
+                seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
+                error = share * wanted - seen
+                determinant = j_xx * j_yy - j_xy * j_yx
+                if not (determinant > 0).all():
+                    raise self.fold_error()
+                if np.abs(error).max() < _TOLERANCE:
+                    break
+                ideal += _newton_step(error, j_xx, j_xy, j_yx, j_yy, determinant)
+            else:
+                raise self.fold_error()
+        return ideal
 
     def stretch(self, places: ArrayLike) -> Array:
         """(...) area of the distorted image over that of the ideal one at (..., 2) ideal points; 0 on a fold."""
@@ -93,7 +114,7 @@ class BrownConrady:
         determinant: Array = j_xx * j_yy - j_xy * j_yx
         return determinant
 
-    def folds(self) -> ValueError:
+    def fold_error(self) -> ValueError:
         """The error of a distortion that maps several points of an image to one."""
         return ValueError(
             f"distortion: {self.coefficients().tolist()} is not invertible over the whole image; make it weaker"
@@ -250,17 +271,20 @@ class Lens:
         seen: NDArray[np.bool_] = inside & (self._stretch(near) > 0)
         return seen
 
-    def into_field(self, rays: ArrayLike) -> Array:
-        """(..., 3) rays in the rig's axes, z > 0; those beyond the field, moved to its edge, outside the image."""
+    def image_of_rays(self, rays: ArrayLike) -> Array:
+        """(..., 2) pixels of (..., 3) rays in the rig's axes, z > 0; outside the image for those beyond the field."""
         directions = np.asarray(rays, dtype=np.float64)
-        places = directions[..., :2] / directions[..., 2:]
-        low, high = self.field
-        beyond = ~((places >= low) & (places <= high)).all(axis=-1)
+        beyond = ~self.is_in_field(directions)
         if not beyond.any():
-            return directions
-        moved = directions.copy()
-        moved[beyond, :2], moved[beyond, 2] = np.clip(places[beyond], low, high), 1.0
-        return moved
+            return self.project_rays(directions)
+        moved, (low, high) = directions.copy(), self.field
+        moved[beyond, :2] = np.clip(directions[beyond, :2] / directions[beyond, 2:], low, high)
+        moved[beyond, 2] = 1.0
+        pixels = self.project_rays(moved)
+        # Where a lens folds just behind the border, the field's edge may touch the image.
+        inside = beyond & self.camera.contains(pixels)
+        pixels[inside] = _out_of_image(self.camera, pixels[inside])
+        return pixels
 
     def largest_shift_px(self, ideal: PinholeCamera) -> float:
         """Largest distance between a place of the image and that of an ideal camera with the same ray. [px]"""
@@ -292,6 +316,27 @@ class Lens:
         turned = np.einsum("ji,...j->...i", self.ideal_from_real, np.asarray(rays, dtype=np.float64))
         seen = self.distortion.distort(turned[..., :2] / turned[..., 2:])
         return self.camera.project(_with_one(seen))
+
+
+def _out_of_image(camera: PinholeCamera, pixels: Array) -> Array:
+    """(N, 2) pixels of an image, moved away from its principal point until they lie a pixel outside. [px]"""
+    center = np.array([camera.cx_px, camera.cy_px])
+    away = pixels - center
+    ends = np.where(away > 0, np.array([camera.width_px, camera.height_px]) + 0.5, -1.5) - center
+    share = np.divide(ends, away, out=np.full_like(away, np.inf), where=away != 0).min(axis=-1, keepdims=True)
+    moved: Array = center + share * away
+    return moved
+
+
+def _newton_step(error: Array, j_xx: Array, j_xy: Array, j_yx: Array, j_yy: Array, determinant: Array) -> Array:
+    """(..., 2) solution of the Jacobian's equations for (..., 2) errors."""
+    return np.stack(
+        [
+            (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant,
+            (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant,
+        ],
+        axis=-1,
+    )
 
 
 def _with_one(places: Array) -> Array:
@@ -333,6 +378,6 @@ def _undistorted_grid(camera: PinholeCamera, distortion: BrownConrady) -> Array:
     grid = distortion.undistort(camera.rays(_grid_px(camera))[..., :2])
     # Points on both sides of a narrow fold are inverted; the fold lies between them.
     if not (distortion.stretch(_SHARES * _outline(grid)) > 0).all():
-        raise distortion.folds()
+        raise distortion.fold_error()
     grid.flags.writeable = False
     return grid

@@ -78,18 +78,23 @@ class StereoRig:
     def image(self, points_left_m: ArrayLike, eye: Eye) -> Array:
         """Projection of points into the delivered image of an eye.
 
-        The polynomial of a lens may fold points back that lie far aside of what the eye sees. So points beyond its
-        field (`is_in_field`) are moved to the field's edge, which lies outside the image.
-
         Args:
             points_left_m: (..., 3) in the left camera frame, in front of the eye. [m]
             eye: which image.
 
         Returns:
-            (..., 2) pixels. [px]
+            (..., 2) pixels; beyond a lens's field as of `image_px`. [px]
         """
-        ideal, lens = self.project(points_left_m, eye), self.lens(eye)
-        return ideal if lens is None else lens.project_rays(lens.into_field(self.camera.rays(ideal)))
+        return self.image_px(self.project(points_left_m, eye), eye)
+
+    def image_px(self, ideal_px: ArrayLike, eye: Eye) -> Array:
+        """(..., 2) places on the delivered image of (..., 2) pixels of the ideal one.
+
+        The polynomial of a lens may fold points back that lie far aside of what the eye sees. So points beyond its
+        field (`is_in_field`) are moved to the field's edge, and lie outside the image.
+        """
+        ideal, lens = np.asarray(ideal_px, dtype=np.float64), self.lens(eye)
+        return ideal if lens is None else lens.image_of_rays(self.camera.rays(ideal))
 
     def is_in_field(self, ideal_px: ArrayLike, eye: Eye) -> NDArray[np.bool_]:
         """(...) whether (..., 2) pixels of the ideal image lie on the delivered one, or in a margin around it.

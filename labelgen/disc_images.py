@@ -70,7 +70,7 @@ class DiscInEye:
         across = np.linalg.svd(self.normal[None])[2][1:]
         angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
         edge_m = self.center_m + self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ across
-        image = lens.project_rays(lens.into_field(edge_m))
+        image = lens.image_of_rays(edge_m)
         (u_low, v_low), (u_high, v_high) = image.min(axis=0).tolist(), image.max(axis=0).tolist()
         return u_low, v_low, u_high, v_high
 

@@ -243,7 +243,7 @@ def _middle_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform, r
     points = np.stack([rig.image(outline_m, eye) for eye in EYES])
     shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
     scale = shape_radii(shapes) / radius_px
-    # Far outside of the images a lens's polynomial means nothing.
+    # Outlines beyond a lens's field shrink to its edge.
     return np.where(((scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE))[:, None, None], shapes, circle)
 
 

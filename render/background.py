@@ -51,7 +51,7 @@ def _lens_directions(lens: Lens, rotation: NDArray[np.float64], step_px: int) ->
 
 
 @lru_cache(maxsize=4)
-def lens_rays(lens: Lens, step_px: int = 1) -> NDArray[np.float32]:
+def lens_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
     """(h, w, 3) unit directions in the rectified axes of the eye, through every pixel or the grid of `_grid_px`."""
     camera = lens.camera
     u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))

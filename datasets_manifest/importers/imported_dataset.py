@@ -131,7 +131,7 @@ def write_imported(
     Args:
         source: the pairs.
         settings: rig, drogue and meaning of the pixel values.
-        out: the dataset's folder; must not exist yet.
+        out: the dataset's folder; must not exist yet, or be empty.
         advance: called after each pair.
 
     Raises:

@@ -26,7 +26,8 @@ class EstimateFile:
                 same name with `.part` behind it. A pipe or a device is written to directly.
         """
         self._path, self._lines, self._size = path, 0, 0
-        self._part = path.with_name(path.name + PART_SUFFIX) if path.is_file() else path
+        replaces = path.is_file() and not is_stream(path)
+        self._part = path.with_name(path.name + PART_SUFFIX) if replaces else path
 
     def __enter__(self) -> Self:
         """Open the file.
@@ -57,15 +58,15 @@ class EstimateFile:
                 raise ValueError(f"{self._path}: another run is writing it; wait for its end, or name another file")
 
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
-        self._opened.close()
-        if kind is not None and not self._lines:
-            self.remove()
-        elif kind is None and self._part != self._path:
-            try:
-                self._part.replace(self._path)
-            except OSError as error:
-                text = f"{self._path}: cannot be replaced: {error.strerror}; the estimates are in {self._part}"
-                raise OSError(error.errno, text) from error
+        with self._opened:  # no other run may take the file until it has its name
+            if kind is not None and not self._lines:
+                self.remove()
+            elif kind is None and self._part != self._path:
+                try:
+                    self._part.replace(self._path)
+                except OSError as error:
+                    text = f"{self._path}: cannot be replaced: {error.strerror}; the estimates are in {self._part}"
+                    raise OSError(error.errno, text) from error
 
     def write(self, estimate: Estimate) -> None:
         """Append a line.

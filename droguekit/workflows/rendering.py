@@ -95,7 +95,7 @@ def run_lines(out: Location, summary: RunSummary) -> Iterator[str]:
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block, and then raise it again.
+    """Delay Ctrl-C and SIGTERM until the end of the block, and then raise the first one again.
 
     Mesh libraries catch every exception of optional imports, so a `KeyboardInterrupt` in the middle would be lost.
     """
@@ -107,10 +107,11 @@ def delay_interrupts() -> Iterator[None]:
     def hear(number: int, frame: FrameType | None) -> None:
         heard.append(number)
 
-    before = signal.signal(signal.SIGINT, hear)
+    before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if heard:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(heard[0])

@@ -38,7 +38,6 @@ def _detection(
     box = (left, top, right - left, bottom - top)
     size_px = (rig.camera.width_px, rig.camera.height_px)
     inside = intersection_area(box, (-0.5, -0.5, *size_px))
-    # Far outside the field of view the lens polynomial may overflow to nan, for which both comparisons are false.
     is_visible = min(box[2:]) >= _SMALLEST_SIDE_PX and inside >= _SMALLEST_VISIBLE_SHARE * box[2] * box[3]
     return Detection(box, 1.0) if is_visible else None
 

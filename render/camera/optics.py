@@ -242,7 +242,7 @@ def _sun_glare(frame: FrameSpec, eye: Eye, to_sun: Array, falling: Array) -> NDA
         y = ((np.arange(camera.height_px) - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
         cosine = (x * sun[0] + y * sun[1] + sun[2]) / np.sqrt(1.0 + x * x + y * y)
     else:
-        cosine = lens_rays(lens) @ sun
+        cosine = lens_rays(lens, 1) @ sun
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     spread = glare_spread_per_sr(angle, frame.sensor.optics.scattered_fraction)
     veil: NDArray[np.float32] = spread[..., None] * falling.astype(np.float32)

@@ -164,7 +164,7 @@ def _near_lamps(frame: FrameSpec, scene: DrogueScene, rays: FrameRays, moves_px:
             ideal_px = camera.project(points)
             if not frame.rig.is_in_field(ideal_px, eye).any():
                 continue
-            places = np.rint(frame.rig.real_px(ideal_px, eye))
+            places = np.rint(frame.rig.image_px(ideal_px, eye))
             (left, top), (right, bottom) = places.min(axis=0) - reach_px, places.max(axis=0) + reach_px + 1
             columns, rows = (max(int(low), 0) for low in (left, top))
             held[index, rows : max(int(bottom), 0), columns : max(int(right), 0)] = True
@@ -243,7 +243,7 @@ class CenterPasses:
             if narrow.any():
                 ideal_px = camera.project(ends[narrow])
                 seen = self._rig.is_in_field(ideal_px, self._eye).any(axis=-1)
-                ends_px = self._rig.real_px(ideal_px[seen], self._eye)
+                ends_px = self._rig.image_px(ideal_px[seen], self._eye)
                 _draw_lines(np.ascontiguousarray(ends_px), int(surface.part_id), ids)
         return ids
 

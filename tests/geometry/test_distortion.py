@@ -147,8 +147,41 @@ def test_every_pixel_of_an_accepted_lens_has_a_ray() -> None:
     assert accepted > 20
 
 
+# Two folds follow each other beyond the image, and a step from a pixel's distorted place leads behind both.
+TWICE_FOLDED = BrownConrady(k1=0.3444, k2=0.1809, k3=-0.2004, p1=-0.0465, p2=0.0013)
+
+
+def test_rays_of_neighbouring_pixels_are_neighbours() -> None:
+    """A ray of another branch of the polynomial has the right pixel, and no neighbours near it."""
+    lens = Lens(PinholeCamera(320, 240, 201.54, 201.54, 107.45, 141.22), TWICE_FOLDED)
+    rays = lens.rays(np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1))
+    steps = [np.linalg.norm(np.diff(rays, axis=axis), axis=-1) for axis in (0, 1)]
+    assert max(float(step.max()) for step in steps) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_place_beyond_the_field_comes_onto_the_image(seed: int) -> None:
+    rng, lenses = np.random.default_rng(seed), 0
+    while lenses < 20:
+        camera = PinholeCamera(320, 240, *np.repeat(rng.uniform(180.0, 500.0), 2), *rng.uniform([100, 80], [220, 160]))
+        k1, k2, k3 = rng.uniform(-0.5, 0.5, 3)
+        p1, p2 = rng.uniform(-0.05, 0.05, 2)
+        bent = BrownConrady(k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+        turn = exp_twist([0, 0, 0, *rng.normal(scale=0.05, size=3)]).rotation
+        try:
+            rig = StereoRig(camera, 0.12, lenses=(Lens(camera, bent, turn), Lens(camera, bent)))
+        except ValueError:
+            continue
+        lenses += 1
+        field = rig.field_px("left")
+        reach = 0.3 * (field[1] - field[0])
+        ideal = rng.uniform(field[0] - reach, field[1] + reach, (4000, 2))
+        beyond = ~rig.is_in_field(ideal, "left")
+        assert beyond.any() and not camera.contains(rig.image_px(ideal[beyond], "left")).any()
+
+
 def strong_rig(k1: float = -0.5) -> StereoRig:
-    """Small images of a lens that folds at 55 k1^-1/2 degrees from the axis, far outside of them."""
+    """Small images of a lens that folds, for k1 < 0, atan(1 / sqrt(-3 k1)) from the axis, far outside of them."""
     camera = PinholeCamera(320, 240, 533.0, 533.0, 159.5, 119.5)
     lens = Lens(camera, BrownConrady(k1=k1))
     turned = Lens(camera, BrownConrady(k1=k1), exp_twist([0, 0, 0, 0.01, -0.02, 0.03]).rotation)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,3 +38,17 @@ def test_what_a_dead_run_left_is_replaced(tmp_path: Path) -> None:
         file.write(answer(3))
     assert NoFix.model_validate_json(path.read_text()) == answer(3)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_standard_output_in_a_file_is_written_to(tmp_path: Path) -> None:
+    script = (
+        "from pathlib import Path\n"
+        "from tests.workflows.test_estimate_file import answer\n"
+        "from droguekit.workflows.estimate_file import EstimateFile\n"
+        "with EstimateFile(Path('/dev/stdout')) as file:\n"
+        "    file.write(answer(5))\n"
+    )
+    out = tmp_path / "out.jsonl"
+    with out.open("w") as stream:
+        subprocess.run([sys.executable, "-c", script], stdout=stream, check=True)
+    assert NoFix.model_validate_json(out.read_text()) == answer(5)

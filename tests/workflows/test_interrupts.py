@@ -11,21 +11,24 @@ from droguekit.workflows.rendering import delay_interrupts
 
 @pytest.fixture(autouse=True)
 def default_handler() -> Iterator[None]:
-    """Python's own handler, whatever a library imported by an earlier test has put in its place."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """The handlers of the command, whatever a library imported by an earlier test has put in their place."""
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = [signal.signal(number, signal.default_int_handler) for number in numbers]
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
 
 
-def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block(number: signal.Signals) -> None:
     swallowed = reached = False
     with pytest.raises(KeyboardInterrupt):
         with delay_interrupts(), suppress(BaseException):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
             swallowed = True
         reached = True
     assert swallowed and not reached
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(number) is signal.default_int_handler
 
 
 def test_the_handler_of_before_hears_it_once_after_the_block() -> None:

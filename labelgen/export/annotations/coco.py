@@ -55,6 +55,8 @@ IMAGES_FOLDER = "images"
 # of a disc of the drogue's radius, whose area is pi (0.33 m)^2: sigma = 0.025 / (sqrt(pi) 0.33) / 2.
 KEYPOINT_SIGMA = 0.0214
 """COCO's `kpt_oks_sigmas` for every keypoint of a drogue."""
+# In the first bytes of every file that is written here.
+_OWN_HEADER, _HEADER_BYTES = b"droguekit dataset ", 65_536
 
 
 def write_annotations(dataset: Location, out: Location) -> list[Location]:
@@ -158,9 +160,10 @@ def _write(
         for writer in writers.values():
             writer.finish()
     # Of an older export: with its images beside those of this one, two datasets would be one.
-    for split in ("train", "val", "test"):
-        if split not in files and target.exists(f"{own}{split}.json"):
-            target.delete(f"{own}{split}.json")
+    for name in (f"{own}{split}.json" for split in ("train", "val", "test") if split not in files):
+        if target.exists(name) and _OWN_HEADER in target.read(name, 0, _HEADER_BYTES):
+            target.delete(name)
+            log.remark(f"{name} of an older export is removed: the dataset has no pairs of that split")
     return list(files.values())
 
 

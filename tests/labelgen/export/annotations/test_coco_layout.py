@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -182,9 +183,13 @@ def test_files_of_an_older_exports_splits_do_not_stay(tmp_path: Path) -> None:
     dataset, out = tmp_path / "dataset", tmp_path / "out"
     write_whole_dataset(dataset)
     out.mkdir()
-    (out / "notes.json").write_text("{}")
-    for split in ("train", "val", "test"):
-        (out / f"{split}.json").write_text("{}")
-    files = write_export("coco", dataset, out, ExportLog())
-    assert {path.name for path in files} == {"all.json", "train.json", "test.json"}
-    assert {path.name for path in out.iterdir()} == {path.name for path in files} | {"notes.json"}
+    first, log = write_export("coco", dataset, out, ExportLog()), ExportLog()
+    assert {path.name for path in first} == {"all.json", "train.json", "test.json"}
+    shutil.copy(out / "train.json", out / "val.json")
+    assert write_export("coco", dataset, out, log) == first
+    assert {path.name for path in out.iterdir()} == {path.name for path in first}
+    assert log.remarks[-1].startswith("val.json of an older export is removed")
+    # Somebody else's file of that name stays.
+    (out / "val.json").write_text('{"info":{"contributor":"me"}}')
+    write_export("coco", dataset, out, ExportLog())
+    assert (out / "val.json").exists()
