@@ -36,6 +36,7 @@ LATER_CORPUS = {"frames": {"count": 560, "scenes": 140}}
 LATER_SCENES, LATER_NEGATIVE_SCENES = 417, 400
 # Of `missed-scenes.toml`: as many as its rendering had completed when the training began.
 MISSED_SCENES = 83
+ALL_MISSED_SCENES = 200
 # Round things that detectors take for drogues, in frames without one, and many of them to validate with.
 ROUND = {
     "name": "detector-round",
@@ -95,15 +96,17 @@ class Training:
 _FIRST, _SECOND = ("corpus", "more"), ("corpus", "more", "negatives", "flat")
 _FOURTH = ("later-corpus", "later-more", "later-negatives", "missed", "flat")
 _SIXTH = (*_FOURTH, "negatives", "round")
+_SEVENTH = (*_SIXTH, "cones", "newest-more")
 _THREE = (Training("first", _FIRST), Training("second", _SECOND), Training("third", _SECOND, has_grounds=True))
 # A fifth training led nowhere, see RESULTS.md.
 TRAININGS: dict[str, tuple[Training, ...]] = {
-    "l": (*_THREE, Training("fourth", _SIXTH, has_grounds=True)),
+    "l": (*_THREE, Training("fourth", _SIXTH, has_grounds=True), Training("fifth", _SEVENTH, has_grounds=True)),
     "s": (
         *_THREE,
         Training("fourth", _FOURTH, has_grounds=True),
         Training("sixth", _SIXTH, has_grounds=True),
-        Training("seventh", (*_SIXTH, "cones", "newest-more"), has_grounds=True),
+        Training("seventh", _SEVENTH, has_grounds=True),
+        Training("eighth", (*_SEVENTH, "later-missed"), has_grounds=True),
     ),
 }
 
@@ -134,6 +137,7 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
         "later-negatives": (negatives, _frames_behind(negatives.recipe, NEGATIVE_SCENES, LATER_NEGATIVE_SCENES)),
         "newest-more": (more, _frames_behind(more.recipe, LATER_SCENES, NEWEST_SCENES)),
         "missed": (missed, frames_of_first_scenes(missed.recipe, MISSED_SCENES)),
+        "later-missed": (missed, _frames_behind(missed.recipe, MISSED_SCENES, ALL_MISSED_SCENES)),
         **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
     }
     needed = {name for training in TRAININGS[variant] for name in training.corpora} | {"test", "empty"}
