@@ -55,8 +55,6 @@ IMAGES_FOLDER = "images"
 # of a disc of the drogue's radius, whose area is pi (0.33 m)^2: sigma = 0.025 / (sqrt(pi) 0.33) / 2.
 KEYPOINT_SIGMA = 0.0214
 """COCO's `kpt_oks_sigmas` for every keypoint of a drogue."""
-# In the first bytes of every file that is written here.
-_OWN_HEADER, _HEADER_BYTES = b"droguekit dataset ", 65_536
 
 
 def write_annotations(dataset: Location, out: Location) -> list[Location]:
@@ -152,16 +150,14 @@ def _write(
                         "copies"
                     )
                 elif sensor.encoding == "linear":
-                    log.remark(
-                        "the named images are linear, dark to viewers: add --images for copies on the sRGB curve"
-                    )
+                    log.remark("the named images are linear, dark to viewers: add --images for copies on sRGB's curve")
                 masked = None if drogue is None else objects if part_id is not None else 0
                 log_missing_labels(log, record, eye, masked)
         for writer in writers.values():
             writer.finish()
     # Of an older export: with its images beside those of this one, two datasets would be one.
     for name in (f"{own}{split}.json" for split in ("train", "val", "test") if split not in files):
-        if target.exists(name) and _OWN_HEADER in target.read(name, 0, _HEADER_BYTES):
+        if target.exists(name) and b"droguekit dataset " in target.read(name, 0, 65_536):
             target.delete(name)
             log.remark(f"{name} of an older export is removed: the dataset has no pairs of that split")
     return list(files.values())
