@@ -292,7 +292,7 @@ def test_a_damaged_picture_is_told_in_one_line(suffix: str, tmp_path: Path, capf
     source = save(tmp_path / "flight", f"left/1.{suffix}", f"right/1.{suffix}", values=noise)
     path = source / f"left/1.{suffix}"
     whole = path.read_bytes()
-    path.write_bytes(whole[:-2] + bytes(range(1, 9)) + whole[-2:] if suffix == "jpg" else whole[:-30])
+    path.write_bytes(whole[:-2] + bytes(range(1, 41)) + whole[-2:] if suffix == "jpg" else whole[:-30])
     assert import_with(source, *calibration(tmp_path)) == WRONG_INPUT
     (line,) = capfd.readouterr().err.splitlines()
     assert f"left/1.{suffix}: is " in line and "damaged" in line
