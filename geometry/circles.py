@@ -73,14 +73,13 @@ def disc_image_centers(
     if len(centers) != len(radii):
         raise ValueError(f"radii_m: {len(radii)} for {len(centers)} discs")
     outlines = disc_outline(left_from_drogue, centers, radii, _OUTLINE_POINTS)
-    return np.stack(
-        [
-            _polygon_centroid(rig.image(outline, eye))
-            if rig.is_in_field(rig.project(outline, eye), eye).all()
-            else rig.image(left_from_drogue.apply(center), eye)
-            for center, outline in zip(centers, outlines, strict=True)
-        ]
-    )
+    images = [
+        _polygon_centroid(rig.image(outline, eye))
+        if rig.is_in_field(rig.project(outline, eye), eye).all()
+        else rig.image(left_from_drogue.apply(center), eye)
+        for center, outline in zip(centers, outlines, strict=True)
+    ]
+    return np.reshape(images, (len(centers), 2))
 
 
 def _polygon_centroid(corners: Array) -> Array:

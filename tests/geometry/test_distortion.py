@@ -188,6 +188,11 @@ def strong_rig(k1: float = -0.5) -> StereoRig:
     return StereoRig(camera, 0.12, lenses=(lens, turned))
 
 
+def test_a_drogue_without_markers_has_no_centres() -> None:
+    pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 5.0]))
+    assert disc_image_centers(RIG, pose, np.zeros((0, 3)), np.zeros(0), "left").shape == (0, 2)
+
+
 @pytest.mark.parametrize("eye", EYES)
 def test_the_field_holds_the_image_and_nothing_that_folds_into_it(eye: Eye) -> None:
     rig = strong_rig()
