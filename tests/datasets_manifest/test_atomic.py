@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -78,28 +77,16 @@ def test_an_error_within_an_error_is_told_once(tmp_path: Path) -> None:
     assert names(tmp_path) == ["file"]
 
 
-@pytest.fixture
-def mounted(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 64 kB of its own."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode != 0:
-        pytest.skip("a disk can only be mounted by root")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-def test_a_mounted_folder_is_filled(mounted: Path) -> None:
-    with new_folder(mounted) as folder:
+def test_a_mounted_folder_is_filled(small_disk: Path) -> None:
+    with new_folder(small_disk) as folder:
         fill(folder)
-    assert names(mounted) == WHOLE
+    assert names(small_disk) == WHOLE
 
 
-def test_a_disk_that_takes_no_writing_is_called_that(mounted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_disk_that_takes_no_writing_is_called_that(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from droguekit.cli.main import WRONG_INPUT, run
 
-    subprocess.run(["mount", "-o", "remount,ro", str(mounted)], check=True)
-    assert run(["new", "recipe", "--out", str(mounted / "mine.toml")]) == WRONG_INPUT
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    assert run(["new", "recipe", "--out", str(small_disk / "mine.toml")]) == WRONG_INPUT
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.endswith("mine.toml: cannot be written: Read-only file system")
