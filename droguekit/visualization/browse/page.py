@@ -182,6 +182,7 @@ def _rig_table(rig: StereoRig) -> dict[str, Any]:
             "camera": intrinsics(lens.camera),
             "distortion": lens.distortion.coefficients().tolist(),
             "real_from_ideal": lens.ideal_from_real.T.ravel().tolist(),
+            "field": lens.field.tolist(),
         }
         for lens in rig.lenses or ()
     ]

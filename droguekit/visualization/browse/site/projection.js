@@ -31,12 +31,13 @@ var droguekit = {};
     return [(depth * turned[0]) / turned[2] - alongX, (depth * turned[1]) / turned[2] - alongY];
   }
 
-  /** Pixel of a distorting lens for a direction in the rectified rig (OpenCV's models and coefficients). [px] */
-  function throughLens(lens, direction) {
+  /** Pixel of a distorting lens for a direction, with z = 1, in the rectified rig (OpenCV's models). [px]
+   * What lies beyond the lens's field is drawn at its edge: its polynomial may fold back into the image there. */
+  function throughLens(lens, xIdeal, yIdeal) {
+    const [low, high] = lens.field;
+    const [a, b] = [xIdeal, yIdeal].map((value, axis) => Math.min(Math.max(value, low[axis]), high[axis]));
     const turn = lens.real_from_ideal;
-    const [u, v, w] = [0, 3, 6].map(
-      (row) => turn[row] * direction[0] + turn[row + 1] * direction[1] + turn[row + 2] * direction[2],
-    );
+    const [u, v, w] = [0, 3, 6].map((row) => turn[row] * a + turn[row + 1] * b + turn[row + 2]);
     const [x, y] = [u / w, v / w];
     const [k1, k2, p1, p2, k3, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0, tauX = 0, tauY = 0] =
       lens.distortion;
@@ -49,9 +50,9 @@ var droguekit = {};
 
   /** Pixel of a point of the left camera's frame [m] in an eye, "left" or "right". [px] */
   function imageOf(rig, eye, point) {
-    const direction = [(point[0] - (eye === "right" ? rig.baseline_m : 0)) / point[2], point[1] / point[2], 1];
-    if (rig.lenses === null) return pixel(rig.camera, direction[0], direction[1]);
-    return throughLens(rig.lenses[eye === "left" ? 0 : 1], direction);
+    const [x, y] = [(point[0] - (eye === "right" ? rig.baseline_m : 0)) / point[2], point[1] / point[2]];
+    if (rig.lenses === null) return pixel(rig.camera, x, y);
+    return throughLens(rig.lenses[eye === "left" ? 0 : 1], x, y);
   }
 
   /** Corners of a ring's image in an eye [px], or null where it reaches behind the eye. */
