@@ -26,7 +26,8 @@ _UPRIGHT: Final = 1
 # OpenCV applies the EXIF orientation of these; TIFF has the same number as a tag of its own.
 _TURNED_BY_OPENCV: Final = ("JPEG", "MPO", "PNG", "TIFF")
 # Only files that begin or hold these can have an orientation or pages; Pillow decodes a whole PNG to look for it.
-_TIFF_AND_WEBP: Final = (b"II", b"MM", b"RIFF")
+_TIFF: Final = (b"II", b"MM")
+_TIFF_AND_WEBP: Final = (*_TIFF, b"RIFF")
 _ORIENTATION_MARKS: Final = (b"Exif", b"eXIf", b"exif", b"adobe.xmp", b"rientation")
 
 _STANDARD_ERROR: Final = 2
@@ -34,13 +35,14 @@ _SILENT: Final = 0  # cv::utils::logging::LOG_LEVEL_SILENT
 _STANDARD_ERROR_LOCK: Final = threading.Lock()
 # Webcams put up to some ten bytes behind the last block of pixels, before the end of the image.
 _FILLED: Final = rb"1?\d extraneous bytes before marker 0xd9"
-# libjpeg-turbo 3, jerror.h: warnings of wrong pixels, of which it writes the first alone, and of unusual files.
+# libjpeg-turbo 3, jerror.h: warnings of wrong pixels, of which it writes the first alone, and of unusual files. What
+# libtiff writes of the file, which Pillow names so, beside the error that Pillow raises, is among the latter.
 _DAMAGE: Final = (
     rb"Corrupt JPEG data: (?!%b)|Premature end of JPEG file|Inconsistent progression sequence |libpng error: " % _FILLED
 )
 _UNUSUAL: Final = (
     rb"Corrupt JPEG data: %b|libpng warning: |Invalid SOS parameters |Unknown Adobe color transform |"
-    rb"Warning: unknown JFIF " % _FILLED
+    rb"Warning: unknown JFIF |[A-Z]\w*Decode\w*: |TIFF\w*: |tempfile\.tif: |JPEGLib: |Fax\w*: " % _FILLED
 )
 _DAMAGE_LINE: Final = re.compile(rb"^(?:%b)[^\n]*" % _DAMAGE, re.MULTILINE)
 _DECODER_LINE: Final = re.compile(rb"^(?:%b|%b)[^\n]*\n?" % (_DAMAGE, _UNUSUAL), re.MULTILINE)
@@ -93,8 +95,8 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
 def _decoded(data: NDArray[np.uint8]) -> tuple[Any, str | None]:
     """The image in OpenCV's order, None where there is none, and what its decoder says of damage, None for nothing.
 
-    libjpeg, libpng and OpenCV tell of faults on standard error alone, which belongs to the whole process: one decodes
-    at a time, and what else is written meanwhile is passed on.
+    The decoders tell of faults on standard error, most of them nowhere else, which belongs to the whole process: one
+    decodes at a time, and what else is written meanwhile is passed on.
 
     Raises:
         ValueError: a lack of memory.
@@ -107,6 +109,7 @@ def _decoded(data: NDArray[np.uint8]) -> tuple[Any, str | None]:
             os.dup2(written.fileno(), _STANDARD_ERROR)
             with limited_memory(data.size):
                 image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+                fault = _tiff_fault(data) if image is not None and image.dtype == np.uint8 else None
         finally:
             os.dup2(shown, _STANDARD_ERROR)
             os.close(shown)
@@ -118,7 +121,25 @@ def _decoded(data: NDArray[np.uint8]) -> tuple[Any, str | None]:
                 with suppress(OSError):
                     os.write(_STANDARD_ERROR, others)
     damage = _DAMAGE_LINE.search(said)
-    return image, None if damage is None else damage[0].decode("ascii", "replace")
+    return image, fault if damage is None else damage[0].decode("ascii", "replace")
+
+
+def _tiff_fault(data: NDArray[np.uint8]) -> str | None:
+    """What Pillow says of the compressed pixels of a TIFF of 8 bits: OpenCV leaves out what it cannot decode there."""
+    file = data.tobytes()
+    if not file.startswith(_TIFF):
+        return None
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            image = Image.open(io.BytesIO(file))
+        except Exception:  # a TIFF of a kind that Pillow does not know
+            return None
+        with image:
+            try:
+                image.load()
+            except OSError as error:
+                return f"TIFF: {error}"
+    return None
 
 
 def _check_size(data: NDArray[np.uint8], name: str) -> None:

@@ -152,6 +152,24 @@ def test_a_jpeg_that_its_decoder_calls_corrupt_is_refused(capfd: pytest.CaptureF
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("codec", ["tiff_lzw", "tiff_adobe_deflate"])
+@pytest.mark.parametrize("bands", ["L", "RGB"])
+def test_a_compressed_tiff_with_wrong_bytes_is_refused(
+    codec: str, bands: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(landscape(2)).convert(bands).save(stream, "TIFF", compression=codec)
+    whole = np.frombuffer(stream.getvalue(), np.uint8)
+    wrong = whole.copy()
+    wrong[whole.size // 3 : whole.size // 3 + 20] ^= 0x5A
+    assert cv2.imdecode(wrong, cv2.IMREAD_ANYCOLOR) is not None
+    capfd.readouterr()
+    with pytest.raises(ValueError, match=r"^a\.tif: is damaged \(.*\); copy it anew"):
+        decode_image_file(wrong, "a.tif")
+    decode_image_file(whole, "a.tif")
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP"])
 @pytest.mark.parametrize("fault", ["cut", "flipped"])
 def test_decoders_write_nothing_of_their_own(kind: str, fault: str, capfd: pytest.CaptureFixture[str]) -> None:
