@@ -117,6 +117,12 @@ class StereoRig:
             raise ValueError(f"eye: the {eye} one has no lens, and no end of its field")
         return self.camera.project(np.column_stack([lens.field, np.ones(2)]))
 
+    @property
+    def delivered_focal_px(self) -> float:
+        """Focal length of the delivered images: the geometric mean of the axes', and of both eyes the mean. [px]"""
+        cameras = [self.camera] if self.lenses is None else [lens.camera for lens in self.lenses]
+        return float(np.mean([np.sqrt(camera.fx_px * camera.fy_px) for camera in cameras]))
+
     def largest_shift_px(self) -> float:
         """Largest displacement by the lenses along the border of an ideal image; 0 for ideal eyes. [px]"""
         if self.lenses is None:

@@ -111,14 +111,13 @@ def _features(
 ) -> tuple[Feature, ...]:
     """Per eye the markers and then the hub's outer edge, at their places in the delivered images."""
     features = []
-    assert observation.hub_cov_px2 is not None
-    markers_px, hub_px = distort_observation(observation)
+    seen = distort_observation(observation)
     for eye in range(len(EYES)):
         for index in np.flatnonzero(observation.seen[eye]):
-            measured = markers_px[eye, index], observation.cov_px2[eye, index]
+            measured = seen.pixels_px[eye, index], seen.cov_px2[eye, index]
             features.append(_feature(EYES[eye], int(index), measured, bool(used[eye, index])))
         if observation.hub_seen[eye, OUTER_EDGE]:
-            measured = hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
+            measured = seen.hub_px[eye, OUTER_EDGE], seen.hub_cov_px2[eye, OUTER_EDGE]
             hub_used = used_hub is not None and bool(used_hub[eye, OUTER_EDGE])
             features.append(_feature(EYES[eye], "hub", measured, hub_used))
     return tuple(features)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Literal, TypeVar
 
@@ -247,8 +248,11 @@ class PairNavigator:
         if len(boxes) == len(EYES):
             return boxes
         ((eye, (x, y, width, height)),) = boxes.items()
-        depth_m = self._rig.camera.fx_px * 2 * self._rim_radius_m / max(width, height)
-        middle_m = depth_m * self._rig.rays((x + width / 2, y + height / 2), eye) + self._rig.eye_offset_m(eye)
+        middle_px = np.array([x + width / 2, y + height / 2])
+        # What a pixel spans there, along both axes, on a plane at a distance of one.
+        steps = self._rig.rays(middle_px + np.eye(2) / 2, eye) - self._rig.rays(middle_px - np.eye(2) / 2, eye)
+        depth_m = 2 * self._rim_radius_m / (np.linalg.norm(steps, axis=-1) * (width, height)).max()
+        middle_m = depth_m * self._rig.rays(middle_px, eye) + self._rig.eye_offset_m(eye)
         predicted = rim_boxes(self._rig, self._rim_radius_m, RigidTransform(np.eye(3), middle_m))
         others = {region.eye: region.box_xywh_px for region in regions_of(predicted, OTHER_EYE)}
         return others | boxes
@@ -347,7 +351,10 @@ def _match_cut_rings(
 ) -> list[RingMatch | None]:
     """The part of the ring that the images' edges leave, in both images or in none."""
     size_px = rig.camera.width_px, rig.camera.height_px
-    parts = [match_cut_ring(centroids.blobs, _sized(layout, centroids), size_px) for centroids in (left, right)]
+    parts = [
+        match_cut_ring(seen.blobs, _sized(layout, seen), size_px, partial(rig.image_px, eye=eye))
+        for seen, eye in zip((left, right), EYES, strict=True)
+    ]
     parts = _match_missing_eye(parts, (left, right), rig, layout, _FEWEST_BESIDE_A_CUT_RING)
     return [None, None] if parts[0] is None or parts[1] is None else parts
 

@@ -71,8 +71,8 @@ def refine(
         measured where the pose of the fitted markers predicts them.
     """
     layout = observation.layout
-    radius_px = observation.rig.camera.fx_px * layout.radius_m / rough.left_from_drogue.translation_m[2]
-    discs = _initial_discs(observation, rough, radius_px)
+    radius_px = _radius_px(observation.rig, layout, rough.left_from_drogue)
+    discs = _initial_discs(observation, rough)
     face = _face_background(layout, np.nonzero(observation.seen)[1], radius_px / layout.radius_m)
     gap_px = (smallest_gap_m(layout) / layout.radius_m - 2) * radius_px
     if radius_px < EDGELESS_RADIUS_PX or (radius_px <= LARGEST_SMALL_RADIUS_PX and gap_px < _CLOSE_PX):
@@ -124,7 +124,7 @@ def _refine_small(
     """
     whole = _with_predicted_markers(observation, rough)
     face = _face_background(observation.layout, np.nonzero(whole.seen)[1], radius_px / observation.layout.radius_m)
-    fits = fit_small_discs(images, _initial_discs(whole, rough, radius_px), face)
+    fits = fit_small_discs(images, _initial_discs(whole, rough), face)
     fits = fits.take(np.flatnonzero(observation.seen[whole.seen]))
     eyes = np.nonzero(observation.seen)[0]
     for eye in np.unique(eyes):
@@ -149,13 +149,19 @@ def _with_predicted_markers(observation: Observation, rough: Solution) -> Observ
     return replace(observation, pixels_px=pixels)
 
 
-def _initial_discs(observation: Observation, rough: Solution, radius_px: float) -> Ellipses:
+def _radius_px(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> float:
+    """Radius of a marker's image near the axis of the delivered images. [px]"""
+    return rig.delivered_focal_px * layout.radius_m / float(pose.translation_m[2])
+
+
+def _initial_discs(observation: Observation, rough: Solution) -> Ellipses:
     """Outlines of the observed markers in the delivered images, by their places and their rough pose."""
     rig, layout = observation.rig, observation.layout
     eyes, index = np.nonzero(observation.seen)
-    sizes = np.broadcast_to(radius_px * np.eye(2), (layout.count, 2, 2))
-    seen = zip(EYES, observation.pixels_px, strict=True)
-    centers_px = np.stack([distort_points(rig, eye, places, sizes) for eye, places in seen])
+    ideal_px_per_m = np.array([rig.camera.fx_px, rig.camera.fy_px]) / rough.left_from_drogue.translation_m[2]
+    sizes = np.broadcast_to(np.diag(layout.radius_m * ideal_px_per_m), (layout.count, 2, 2))
+    seen = zip(EYES, observation.pixels_px, observation.cov_px2, strict=True)
+    centers_px = np.stack([distort_points(rig, eye, places, sizes, cov)[0] for eye, places, cov in seen])
     return Ellipses(eyes, centers_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
 
 
@@ -171,7 +177,7 @@ def _balanced_weight(
 ) -> float:
     """Weight of the other colours at which the rim casts no step of light, see `balancing_weight`."""
     rig, layout, translation_m = observation.rig, observation.layout, rough.left_from_drogue.translation_m
-    radius_px = rig.camera.fx_px * layout.radius_m / translation_m[2]
+    radius_px = _radius_px(rig, layout, rough.left_from_drogue)
     middles_px = np.stack([rig.image(translation_m, eye) for eye in EYES])
     # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
     middles_px[~observation.seen.any(axis=1)] = -1e6
@@ -218,7 +224,7 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
     edge there, and leave no face to fit its light to.
     """
     depth_m = pose.translation_m[2]
-    radius_px = rig.camera.fx_px * layout.radius_m / depth_m
+    radius_px = _radius_px(rig, layout, pose)
     even = np.broadcast_to(_middle_shapes(rig, layout, pose, radius_px)[:, None], (len(EYES), layout.count, 2, 2))
     if radius_px <= WHOLE_RADIUS_PX:
         return even
@@ -236,7 +242,7 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
 def _middle_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform, radius_px: float) -> Array:
     """(2, 2, 2) shapes in which the eyes show a marker that faces them in the drogue's middle."""
     circle = np.broadcast_to(radius_px * np.eye(2), (len(EYES), 2, 2))
-    if rig.lenses is None:
+    if rig.lenses is None and rig.camera.fx_px == rig.camera.fy_px:
         return circle
     facing = RigidTransform(np.eye(3), pose.translation_m)
     outline_m = disc_outline(facing, np.zeros(3), layout.radius_m, _OUTLINE_POINTS)

@@ -92,7 +92,7 @@ class RollDecoder:
         """(N,) light of the markers' colour at their places; NaN outside the image. [DN]"""
         places = self._rig.image(pose.apply(self._layout.centers_m), eye)
         width, height = images.size_px
-        radius_px = self._rig.camera.fx_px * self._layout.radius_m / max(float(pose.translation_m[2]), 1e-9)
+        radius_px = self._rig.delivered_focal_px * self._layout.radius_m / max(float(pose.translation_m[2]), 1e-9)
         spread_px = float(np.clip(radius_px / 2, _LEAST_SPREAD_PX, _MOST_SPREAD_PX))
         inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
         light = np.full(len(places), np.nan)

@@ -9,6 +9,7 @@ map has one more column, for the depth.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -42,6 +43,10 @@ _GOOD_RMS_FRACTION = 0.1
 # Another order of the markers is as good where its distances from the map are at most this many times as large, and
 # another one where it moves a marker by more than this many radii.
 _AS_GOOD, _ELSEWHERE = 2.0, 1.0
+# Ways from a disc's centre to its left, right, upper and lower end, in radii.
+_SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+
+ImageMap = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,17 +82,25 @@ class RingMatch:
         # The least extent of a disc, less the error of the map.
         return ~self._inside(layout, size_px, _singular_values(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction))
 
-    def clear(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-        """(N,) markers whose images certainly lie within a picture of (width, height)."""
-        return self._inside(layout, size_px, _singular_values(self.affine)[0] * _REACH)
+    def clear(
+        self, layout: MarkerLayout, size_px: tuple[int, int], image_px: ImageMap | None = None
+    ) -> NDArray[np.bool_]:
+        """(N,) markers whose images certainly lie within a picture of (width, height), see `match_cut_ring`."""
+        return self._inside(layout, size_px, _singular_values(self.affine)[0] * _REACH, image_px)
 
-    def _inside(self, layout: MarkerLayout, size_px: tuple[int, int], reach_px_per_m: float) -> NDArray[np.bool_]:
+    def _inside(
+        self,
+        layout: MarkerLayout,
+        size_px: tuple[int, int],
+        reach_px_per_m: float,
+        image_px: ImageMap | None = None,
+    ) -> NDArray[np.bool_]:
         """(N,) markers whose centres are further from the picture's edge than their radius times a scale."""
         places_px = _places_px(layout, self.affine, self.lean_px_per_m)
-        reach_px = layout.radius_m * reach_px_per_m
-        inside: NDArray[np.bool_] = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(
-            axis=1
-        )
+        ends_px = places_px[:, None] + layout.radius_m * reach_px_per_m * _SIDES
+        if image_px is not None:
+            ends_px = image_px(ends_px)
+        inside: NDArray[np.bool_] = ((ends_px > 0) & (ends_px < np.array(size_px) - 1)).all(axis=(1, 2))
         return inside
 
     def moved(self, shift_px: tuple[float, float]) -> RingMatch:
@@ -123,7 +136,9 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
     return _best_match(blobs, layout, least_markers(layout))
 
 
-def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int]) -> RingMatch | None:
+def match_cut_ring(
+    blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int], image_px: ImageMap | None = None
+) -> RingMatch | None:
     """At least four markers of a ring whose other markers the picture's edge cuts off, or None.
 
     These do not count as the drogue unless the other eye shows the same.
@@ -131,10 +146,11 @@ def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int])
     Args:
         blobs: of one image.
         layout: the drogue's markers.
-        size_px: width and height of the image.
+        size_px: width and height of the delivered image.
+        image_px: where places among the blobs lie on the delivered image; None where they are places on it.
     """
     match = _best_match(blobs, layout, FEW)
-    if match is None or (match.clear(layout, size_px) & (match.blob_of_marker < 0)).any():
+    if match is None or (match.clear(layout, size_px, image_px) & (match.blob_of_marker < 0)).any():
         return None
     return match
 

@@ -292,6 +292,8 @@ def _rig_mismatch(observation: Observation) -> NoFixReason | None:
     places, pixels = observation.layout.centers_m[paired], observation.pixels_px[:, paired]
     gaps_m, gaps_px = places[first] - places[second], pixels[:, first] - pixels[:, second]
     # Medians, so that one or two outliers do not count.
+    # As if pixels were square, since disparities are along x.
+    gaps_px = gaps_px * (1.0, observation.rig.camera.fx_px / observation.rig.camera.fy_px)
     px_per_m = np.sqrt((gaps_px**2).sum(axis=2) / (gaps_m**2).sum(axis=1))
     expected_px = observation.rig.baseline_m * median(px_per_m)
     disparity_px = median(pixels[0, :, 0] - pixels[1, :, 0])

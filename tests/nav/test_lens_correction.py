@@ -41,26 +41,29 @@ def test_centres_of_discs_go_back_and_forth(eye: Eye) -> None:
     real = disc_image_centers(RIG, POSE, centers_m, radii_m, eye)
     cov = np.broadcast_to(np.eye(2), (3, 2, 2))
     # What is left is of the third order in the disc's size: perspective within it, and higher slopes of the lens.
-    np.testing.assert_allclose(distort_points(RIG, eye, ideal, shapes_of(RIG.project, centers_m, eye)), real, atol=3e-3)
+    back, delivered = distort_points(RIG, eye, ideal, shapes_of(RIG.project, centers_m, eye), cov)
+    np.testing.assert_allclose(back, real, atol=3e-3)
     found, moved = undistort_points(RIG, eye, real, shapes_of(RIG.image, centers_m, eye), cov)
     np.testing.assert_allclose(found, ideal, atol=3e-3)
     outline = disc_outline(POSE, centers_m[0], 0.05, 64)
     growth = np.ptp(RIG.project(outline, eye), axis=0) / np.ptp(RIG.image(outline, eye), axis=0)
     # Sizes of the disc in both images against the slopes that errors are moved by, without their cross terms.
     np.testing.assert_allclose(np.sqrt(np.diagonal(moved[0])), growth, rtol=3e-3)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(delivered[0])), 1 / growth, rtol=3e-3)
 
 
 def test_what_was_not_measured_stays_so() -> None:
     centers = np.array([[np.nan, np.nan], [600.0, 300.0]])
     found, cov = undistort_points(RIG, "right", centers, DISCS, np.full((2, 2, 2), np.nan))
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all() and np.isnan(cov[0]).all()
-    assert np.isnan(distort_points(RIG, "right", centers, DISCS)[0]).all()
+    found, cov = distort_points(RIG, "right", centers, DISCS, np.full((2, 2, 2), np.nan))
+    assert np.isnan(found[0]).all() and np.isfinite(found[1]).all() and np.isnan(cov[0]).all()
 
 
 def test_ideal_eyes_change_nothing() -> None:
     centers, cov = np.array([[10.0, 20.0]]), np.ones((1, 2, 2))
     assert undistort_points(paper_rig(), "left", centers, DISCS[:1], cov) == (centers, cov)
-    assert distort_points(paper_rig(), "left", centers, DISCS[:1]) is centers
+    assert distort_points(paper_rig(), "left", centers, DISCS[:1], cov) == (centers, cov)
 
 
 def test_poses_through_real_lenses() -> None:
