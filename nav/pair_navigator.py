@@ -74,6 +74,8 @@ RIM_METHODS = frozenset({"joint-rim"})
 _LEAST_MARKERS = 3
 # The best rotation must fit the pairs within this share of the gap between neighbours; a wrong one is off by a gap.
 _LARGEST_COST_FRACTION = 0.35
+# Largest scale of a ring, which is drawn out at the side of a wide image, over focal length by distance.
+_LARGEST_STRETCH = 1.5
 # Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
 # have 0.033 of the gap at most.
 _LARGEST_COST_FRACTION_OF_PARTS = 0.05
@@ -327,10 +329,11 @@ def correspond(
     first = _markers(left, rings[0]).reordered(upright)
     second = _markers(right, rings[1])
     disparity_px = rig.baseline_m * rings[0].scale_px_per_m
-    costs = _costs_px(first.centers_px, second.centers_px[permutations], disparity_px)
+    is_part = max(rings[0].count, rings[1].count) < least_markers(layout)
+    stretch = 1.0 if is_part else _LARGEST_STRETCH
+    costs = _costs_px(first.centers_px, second.centers_px[permutations], (disparity_px / stretch, disparity_px))
     best = int(np.argmin(costs))
     gap_px = smallest_gap_m(layout) * rings[0].scale_px_per_m
-    is_part = max(rings[0].count, rings[1].count) < least_markers(layout)
     if costs[best] > (_LARGEST_COST_FRACTION_OF_PARTS if is_part else _LARGEST_COST_FRACTION) * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
     return Observation(rig, layout, *_without_bad_pairs(first, second.reordered(permutations[best])))
@@ -418,17 +421,20 @@ def _rotation_nearest_to_zero(ring: RingMatch, layout: MarkerLayout) -> int:
     return int(np.round(roll * order / (2 * np.pi))) % order
 
 
-def _costs_px(left_px: Array, right_px: Array, disparity_px: float) -> Array:
-    """(T,) root mean squares of row differences, and of disparities against the ring's size, infinite without pairs.
+def _costs_px(left_px: Array, right_px: Array, disparities_px: tuple[float, float]) -> Array:
+    """(T,) root mean squares of row differences, and of disparities against one of all, infinite without pairs.
 
     Args:
         left_px: (N, 2) markers.
         right_px: (T, N, 2) the same in every turn.
-        disparity_px: by the ring's size.
+        disparities_px: the least and the largest by the ring's size; the mean of a turn's pairs is taken between them.
     """
-    squares = (left_px - right_px - (disparity_px, 0.0)) ** 2
-    both = np.isfinite(squares)
+    gaps_px = left_px - right_px
+    both = np.isfinite(gaps_px)
     count = both.sum(axis=(1, 2))
+    sums_px = np.where(both, gaps_px, 0.0)[..., 0].sum(axis=1)
+    gaps_px[..., 0] -= np.clip(2 * sums_px / np.maximum(count, 1), *disparities_px)[:, None]
+    squares = gaps_px**2
     costs: Array = np.sqrt(np.where(both, squares, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1))
     return np.where(count > 0, costs, np.inf)
 

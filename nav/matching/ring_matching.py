@@ -28,7 +28,9 @@ _GUESS_TOLERANCE = 0.8
 _FIT_TOLERANCE = 0.4
 # Least singular value of the fit: markers with a smaller one lie on a line.
 _ON_A_LINE = 1e-6
-_STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
+# Beyond 70 degrees the markers hide in the basket; guesses from two blobs, which ignore tilt, seldom lead to a ring of
+# more than 40.
+_STRONGEST_TILT_COSINE = 0.35
 _REFINED_GUESSES = 16
 _VOTE_DECIMALS = 3
 # Four numbers in each row of the map of markers at several depths, and one marker to spare.

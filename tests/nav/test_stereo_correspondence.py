@@ -10,8 +10,9 @@ import pytest
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, project_disc_centers
+from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
-from geometry.stereo import EYES, Eye, paper_rig
+from geometry.stereo import EYES, Eye, StereoRig, paper_rig
 from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
 from nav.matching.marker_channel import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
@@ -260,6 +261,41 @@ def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leave
         told["cut"] += int(clearly.sum())
     # Both happen.
     assert min(told.values()) > 100
+
+
+@pytest.mark.parametrize("baseline_m", [0.12, 1.0])
+def test_rings_at_the_sides_of_wide_images_belong_together(baseline_m: float) -> None:
+    """There a tilted ring is drawn out, and its size says more than its distance."""
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(4)
+    rig = StereoRig(PinholeCamera(1280, 960, 600.0, 600.0, 639.5, 479.5), baseline_m)
+    size_px, matched_rings, sizes_off = np.array([1280, 960]), 0, []
+    for _ in range(150):
+        z_m = rng.uniform(3 * baseline_m + 1, 8)
+        x_m, y_m = rng.uniform(-1, 1, 2) * size_px / 2 / rig.camera.fx_px * z_m
+        place = make_pose(x_m + baseline_m / 2, y_m, z_m, *rng.uniform(-20, 20, 2), rng.uniform(-22, 22))
+        radius_px = rig.camera.fx_px * layout.radius_m / z_m
+        centers = [rig.project(place.apply(layout.centers_m), eye) for eye in EYES]
+        if any((np.minimum(each, size_px - each) < radius_px).any() for each in centers):
+            continue
+        areas, cov = (
+            np.full(layout.count, np.pi * radius_px**2),
+            np.broadcast_to(0.01 * np.eye(2), (layout.count, 2, 2)),
+        )
+        rings = [match_ring(Blobs(each, areas), layout) for each in centers]
+        if any(ring is None or ring.count < layout.count for ring in rings):
+            continue
+        matched_rings += 1
+        sizes_off.append(rings[0].scale_px_per_m * z_m / rig.camera.fx_px)
+        orders = [rng.permutation(layout.count) for _ in EYES]
+        seen = [BinaryCentroids(Blobs(each[order], areas), cov) for each, order in zip(centers, orders, strict=True)]
+        observation = correspond(*seen, rig, layout)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        found = [
+            np.argmin(np.linalg.norm(each[:, None] - pixels, axis=2), axis=0)
+            for each, pixels in zip(centers, observation.pixels_px, strict=True)
+        ]
+        np.testing.assert_array_equal(found[0], found[1])
+    assert matched_rings > 50 and max(sizes_off) > 1.2
 
 
 def partly_beside(
