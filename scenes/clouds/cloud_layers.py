@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,6 +54,10 @@ _FIRST_STEP_PX, _BEFORE_CLOUD, _ROW = 8, 0.96, 256
 # Steps between further rays, of which those are marched whose neighbours, twice as far apart, differ more than this.
 # Rays through layers without depth cost so little that fine fibres get theirs.
 _REFINEMENTS, _REFINEMENTS_THIN = ((2, 0.08), (1, 0.35)), ((1, 0.05),)
+
+# A pixel that looks along so much of a swell begins to sparkle, and along so much of it does nothing else; so many
+# neighbours, an odd number, are averaged.
+_SPARKLES_FROM, _SPARKLES, _SPARKLE_PX = 0.04, 0.25, 31
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,15 @@ class LayerGeometry:
             for h in (self._near_m, self._near_m + self._thick_m)
         )
         return entry, leave
+
+    def pixel_length_m(self, rise: _Field, pixel_rad: float) -> _Field:
+        """How much of the layer's plan lies behind a pixel along rays that rise towards the layer, 0 for others. [m]"""
+        entry_m, _ = self.crossing(rise)
+        sine = rise + np.float32(2.0 * self.sign * self.bend_per_m) * entry_m
+        length_m: _Field = np.where(
+            rise > self.least_rise, entry_m * np.float32(pixel_rad) / np.maximum(sine, np.float32(1e-5)), 0.0
+        )
+        return length_m
 
     def fading(self, rise: _Field) -> _Field:
         """Share of the layer's opacity that is left towards the horizon."""
@@ -296,6 +310,24 @@ class CloudLayerRenderer:
                 near = self._march(rays[at], pixel_rad, self._starts(entry_m, every, at, width))
                 large.reshape(-1, 4)[places] = self._layered(near.view, at, through_air)
             picture = large
+        return picture if thin else self._smoothed_afar(picture, directions, pixel_rad)
+
+    def _smoothed_afar(self, picture: Radiance, directions: NDArray[np.float32], pixel_rad: float) -> Radiance:
+        """The picture, averaged along the horizon where a pixel looks along much of a swell or more.
+
+        There each ray meets the layer at random, and the picture would sparkle. Neighbours beside each other meet what
+        other rays of the pixel would.
+        """
+        rise = directions[..., 2] * np.float32(self._where.sign)
+        share = np.clip(self._where.pixel_length_m(rise, pixel_rad) / cloud_shape(self._layer).numbers[5], 0.0, 1.0)
+        share = np.clip((share - _SPARKLES_FROM) / (_SPARKLES - _SPARKLES_FROM), 0.0, 1.0).astype(np.float32)
+        rows = np.flatnonzero(share.any(axis=1))
+        if not len(rows):
+            return picture
+        steps = [np.abs(np.diff(rise, axis=axis)).mean() for axis in (0, 1)]
+        size = (_SPARKLE_PX, 1) if steps[1] < steps[0] else (1, _SPARKLE_PX)
+        part = slice(rows[0], rows[-1] + 1)
+        picture[part] += share[part, :, None] * (cv2.GaussianBlur(picture[part], size, 0) - picture[part])
         return picture
 
     def _starts(self, entry_m: _Field | None, every: int, indices: NDArray[np.int64], width: int) -> _Field | None:

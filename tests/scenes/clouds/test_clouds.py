@@ -312,6 +312,22 @@ def test_what_is_seen_of_a_large_picture_is_what_single_rays_see(
     assert (off > 0.35).mean(axis=(0, 1)).max() < 0.005
 
 
+@pytest.mark.parametrize(("kind", "thickness_m"), [("stratus", 400.0), ("altocumulus", 200.0), ("cumulus", 600.0)])
+def test_clouds_near_the_horizon_do_not_sparkle(kind: str, thickness_m: float) -> None:
+    """A pixel sees the mean of kilometres of a layer there, and not what one ray happens to meet."""
+    cloud, split = layer(kind=kind, thickness_m=thickness_m, cover_fraction=0.6), 5
+    renderer, rays = CloudLayerRenderer(cloud, SIDE_LIGHT), looking(160, 40, 1600.0, 0.8)
+    finer = renderer.view(looking(160 * split, 40 * split, 1600.0 * split, 0.8), 1.0 / (1600.0 * split))
+    whole = (finer.radiance * finer.opacity[..., None]).reshape(40, split, 160, split, 3).mean(axis=(1, 3))
+    single = renderer.view(rays, 1.0 / 1600.0)
+    off = [
+        np.sqrt(np.mean((light - whole) ** 2))
+        for light in (renderer.picture(rays, bare)[..., :3], single.radiance * single.opacity[..., None])
+    ]
+    # The rest is less detail afar, which changes the share of cloud too.
+    assert off[0] < 0.9 * off[1]
+
+
 def test_edges_of_dark_clouds_count_where_it_is_not_known_what_is_behind() -> None:
     """As lamps of a town may be, below clouds by night."""
     cloud, rays = layer(feature_size_m=900.0, thickness_m=300.0), looking(320, 240, 900.0, 25.0)
