@@ -108,6 +108,12 @@ class BrownConrady:
                 raise self.fold_error()
         return ideal
 
+    def slopes(self, places: ArrayLike) -> Array:
+        """(..., 2, 2) derivative of `distort` at (..., 2) ideal points."""
+        ideal = np.asarray(places, dtype=np.float64)
+        slopes: Array = np.stack(self._distort(ideal)[1:], axis=-1).reshape(*ideal.shape, 2)
+        return slopes
+
     def stretch(self, places: ArrayLike) -> Array:
         """(...) area of the distorted image over that of the ideal one at (..., 2) ideal points; 0 on a fold."""
         _, j_xx, j_xy, j_yx, j_yy = self._distort(np.asarray(places, dtype=np.float64))
@@ -316,6 +322,17 @@ class Lens:
         turned = np.einsum("ji,...j->...i", self.ideal_from_real, np.asarray(rays, dtype=np.float64))
         seen = self.distortion.distort(turned[..., :2] / turned[..., 2:])
         return self.camera.project(_with_one(seen))
+
+    def slopes_of_rays(self, rays: ArrayLike) -> Array:
+        """(..., 2, 2) derivative of `project_rays` by x and y of (..., 3) rays scaled to z = 1. [px]"""
+        directions = np.asarray(rays, dtype=np.float64)
+        real_from_ideal = self.ideal_from_real.T
+        turned = np.einsum("ij,...j->...i", real_from_ideal, directions / directions[..., 2:])
+        places, depths = turned[..., :2] / turned[..., 2:], turned[..., 2, None, None]
+        by_turn = (real_from_ideal[:2, :2] - places[..., None] * real_from_ideal[2, :2]) / depths
+        focal_px = np.diag([self.camera.fx_px, self.camera.fy_px])
+        slopes: Array = focal_px @ self.distortion.slopes(places) @ by_turn
+        return slopes
 
 
 def _out_of_image(camera: PinholeCamera, pixels: Array) -> Array:

@@ -66,6 +66,14 @@ class StereoRig:
         ideal, lens = np.asarray(ideal_px, dtype=np.float64), self.lens(eye)
         return ideal if lens is None else lens.project_rays(self.camera.rays(ideal))
 
+    def real_slopes(self, ideal_px: ArrayLike, eye: Eye) -> Array:
+        """(..., 2, 2) derivative of `real_px` at (..., 2) pixels of the ideal image; the identity for an ideal eye."""
+        ideal, lens = np.asarray(ideal_px, dtype=np.float64), self.lens(eye)
+        if lens is None:
+            return np.broadcast_to(np.eye(2), (*ideal.shape, 2))
+        slopes: Array = lens.slopes_of_rays(self.camera.rays(ideal)) / [self.camera.fx_px, self.camera.fy_px]
+        return slopes
+
     def ideal_px(self, real_px: ArrayLike, eye: Eye) -> Array:
         """(..., 2) pixels of the ideal image with the same rays as (..., 2) pixels of the delivered one. [px]"""
         return self.camera.project(self.rays(real_px, eye))

@@ -63,6 +63,15 @@ def test_real_and_ideal_pixels_go_back_and_forth(eye: Eye) -> None:
     np.testing.assert_allclose(RIG.image(RIG.rays(real, eye) * 7.0 + RIG.eye_offset_m(eye), eye), real, atol=1e-9)
 
 
+@pytest.mark.parametrize("eye", EYES)
+def test_slopes_are_those_of_the_way_to_the_delivered_image(eye: Eye) -> None:
+    ideal, step = np.random.default_rng(4).uniform(-0.5, [1279.5, 959.5], (100, 2)), 1e-3
+    ends = [RIG.real_px(ideal + d, eye) - RIG.real_px(ideal - d, eye) for d in step * np.eye(2)]
+    # Rounding of 1e3 px in float64, over steps of 1e-3 px.
+    np.testing.assert_allclose(RIG.real_slopes(ideal, eye), np.stack(ends, axis=-1) / (2 * step), atol=1e-8)
+    np.testing.assert_array_equal(IDEAL.real_slopes(ideal, eye), np.tile(np.eye(2), (100, 1, 1)))
+
+
 def test_rectified_places_triangulate_to_the_point() -> None:
     points = sample_points_m(100)
     left, right = (RIG.ideal_px(RIG.image(points, eye), eye) for eye in EYES)

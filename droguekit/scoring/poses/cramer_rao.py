@@ -55,7 +55,7 @@ def feature_points(layout: MarkerLayout) -> tuple[Array, Array]:
 
 
 def center_jacobian(rig: StereoRig, left_from_drogue: RigidTransform, layout: MarkerLayout, eye: Eye) -> Array:
-    """Derivative of the features' ellipse centres with respect to the pose and to the size of the ring.
+    """Derivative of the features' centres in the delivered image by the pose and the size of the ring.
 
     Args:
         rig: the cameras.
@@ -67,7 +67,8 @@ def center_jacobian(rig: StereoRig, left_from_drogue: RigidTransform, layout: Ma
         (M, 2, 7) derivative with respect to (dt [m], w [rad], s) with t' = t + dt, R' = exp([w]x) R, and the markers'
         places in the drogue scaled by 1 + s while the hub stays. [px/m, px/rad, px]
 
-    Source: derivative of the ellipse centre `pi(t - (r^2 / t_z) (e_z - n_z n))` (see `geometry.circles`).
+    Source: derivative of the ellipse centre `pi(t - (r^2 / t_z) (e_z - n_z n))` (see `geometry.circles`), times that
+        of the lens there, where the eye has one.
     """
     centers, radii = feature_points(layout)
     arms = left_from_drogue.rotate(centers)
@@ -87,7 +88,7 @@ def center_jacobian(rig: StereoRig, left_from_drogue: RigidTransform, layout: Ma
     d_project = np.zeros((len(t), 2, 3))
     d_project[:, 0, 0], d_project[:, 0, 2] = rig.camera.fx_px / z, -rig.camera.fx_px * x / z**2
     d_project[:, 1, 1], d_project[:, 1, 2] = rig.camera.fy_px / z, -rig.camera.fy_px * y / z**2
-    jacobian: Array = d_project @ d_virtual
+    jacobian: Array = rig.real_slopes(rig.camera.project(virtual), eye) @ d_project @ d_virtual
     return jacobian
 
 

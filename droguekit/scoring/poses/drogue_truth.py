@@ -46,7 +46,7 @@ class DrogueTruth:
 
     @cached_property
     def jacobian(self) -> Array:
-        """(2, M, 2, 7) see `bounds.stereo_jacobian`."""
+        """(2, M, 2, 7) see `cramer_rao.stereo_jacobian`."""
         return stereo_jacobian(self.rig, self.left_from_drogue, self.layout)
 
     @property

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,8 +13,13 @@ from droguekit.scoring.poses.centroid_errors import (
     position_error_from_centroids,
     symmetric_orders,
 )
-from droguekit.scoring.poses.cramer_rao import pose_bound
+from droguekit.scoring.poses.cramer_rao import feature_points, pose_bound
 from droguekit.scoring.poses.drogue_truth import drogue_truth
+from geometry.circles import disc_image_centers
+from geometry.distortion import BrownConrady, Lens
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES, StereoRig
 
 
 def test_sigma_and_bias_are_those_of_the_noise(build: SimpleNamespace, rng: np.random.Generator) -> None:
@@ -132,3 +138,31 @@ def test_a_shift_of_the_pose_is_recovered_from_its_centroids(build: SimpleNamesp
     errors = centroid_errors(truth, build.features(moved, lambda: (0.0, 0.0)))
     # The neglected second order is shift^2 / Z ~ 2e-7.
     np.testing.assert_allclose(position_error_from_centroids(truth, errors), shift, atol=1e-6)
+
+
+def test_a_shift_is_recovered_from_the_delivered_images_of_lenses(build: SimpleNamespace) -> None:
+    ideal, shift = build.rig, np.array([1e-4, -2e-4, 1e-3])
+    lens = Lens(PinholeCamera(1280, 960, 2560.0, 2560.0, 639.5, 479.5), BrownConrady(-0.2))
+    rig = StereoRig(ideal.camera, ideal.baseline_m, lenses=(lens, lens))
+    record, pose = build.record(0, build.pose(0.4, -0.2, 6, 4, -7, 3)), build.pose(0.4, -0.2, 6, 4, -7, 3)
+    centers_m, radii_m = feature_points(drogue_truth(record).layout)
+
+    def delivered_px(at: RigidTransform) -> np.ndarray:
+        return np.stack([disc_image_centers(rig, at, centers_m, radii_m, eye) for eye in EYES])
+
+    truth = replace(drogue_truth(record), rig=rig, centers_px=delivered_px(pose))
+    moved = delivered_px(RigidTransform(pose.rotation, pose.translation_m + shift))
+    features = [
+        Feature(
+            eye=eye,
+            index="hub" if place == truth.layout.count else place,
+            center_px=tuple(moved[side, place]),
+            cov_px2=((1e-4, 0.0), (0.0, 1e-4)),
+            used=True,
+        )
+        for side, eye in enumerate(EYES)
+        for place in range(len(centers_m))
+    ]
+    predicted = position_error_from_centroids(truth, centroid_errors(truth, features))
+    # A focal length that is 20 % off would make the depth 20 % wrong; the shift's second order is 2e-7.
+    np.testing.assert_allclose(predicted, shift, atol=1e-6)
