@@ -23,6 +23,8 @@ from datasets_manifest.types.records import PixelBox
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from drogue_models.untrusted_files import parse_json
+from droguekit.scoring.poses.centroid_errors import feature_places
+from droguekit.scoring.poses.cramer_rao import feature_points
 from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.scoring.report.html_page import RowGroup, Table, page_template
 from droguekit.scoring.report.label_drawing import Tile, display_picture, evenly_spaced, label_picture, tile_of
@@ -35,6 +37,8 @@ from geometry.stereo import EYES, Eye, StereoRig
 
 # Enough corners that the box around the rim is right to a hundredth of its width.
 _RIM_POINTS = 64
+# Nearer than this to the plane of the eyes, a point has no image. [m]
+_LEAST_DEPTH_M = 1e-6
 
 
 class BlindFacts(ResultModel):
@@ -49,7 +53,8 @@ class BlindRow(ResultModel):
 
     Attributes:
         n, fixes, fix_fraction: pairs, and those of them with a pose.
-        residual_rms_px: of the centroids that the poses were computed from, each coordinate; None without any. [px]
+        residual_rms_px: of the centroids that the poses were computed from, each coordinate; without those of poses
+            that are not wholly in front of the cameras, which are in no box either; None without any. [px]
         boxes: views of pairs with a pose that have a box.
         middle_in_box_fraction: share of these whose box holds the middle of the rim; None without any.
         rim_box_iou_median: intersection over union of the box and the one around the rim; None without any.
@@ -95,11 +100,14 @@ def check_blind(dataset: Location, estimates: Path, faults: PairFaults | None = 
         faults: count damaged pairs, which are left out; without, such a pair is an error.
 
     Raises:
-        ValueError: the dataset or the file cannot be read, or names pairs that the dataset lacks.
+        ValueError: the dataset, all of its pairs or the file cannot be read, or the file names pairs or features that
+            the dataset lacks.
     """
     index = read_blind_index(dataset)
     methods = estimates_by_method(read_estimates(estimates), index.frames, str(estimates))
     scenes = blind_scenes(dataset, index, faults)
+    if not scenes and faults is not None:
+        raise ValueError(f"{dataset}: no pair can be read, so there is nothing to check: {faults.line()}")
     return BlindCheck(
         dataset=BlindFacts(name=index.name, pairs=len(index.frames)),
         code_version=version("droguekit"),
@@ -133,11 +141,7 @@ def blind_scenes(dataset: Location, index: BlindIndex, faults: PairFaults | None
 
 def marker_images_px(scene: BlindScene, left_from_drogue: RigidTransform, eye: Eye) -> Array:
     """(M, 2) where a pose puts the markers' centroids, then the hub's if there is one, in the delivered image. [px]"""
-    layout = marker_layout(scene.drogue)
-    centers, radii = layout.centers_m, np.full(layout.count, layout.radius_m)
-    if layout.hub_center_m is not None:
-        centers = np.concatenate([centers, layout.hub_center_m[None]])
-        radii = np.append(radii, layout.hub_outer_radius_m)
+    centers, radii = feature_points(marker_layout(scene.drogue))
     return disc_image_centers(scene.rig, left_from_drogue, centers, radii, eye)
 
 
@@ -149,38 +153,48 @@ def rim_box_px(scene: BlindScene, left_from_drogue: RigidTransform, eye: Eye) ->
     return (float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1]))
 
 
+def _is_in_front(scene: BlindScene, left_from_drogue: RigidTransform) -> bool:
+    """Whether the rim and all features lie in front of the cameras, which have their images only there."""
+    centers, radii = feature_points(marker_layout(scene.drogue))
+    centers, radii = np.vstack([centers, np.zeros(3)]), np.append(radii, scene.drogue.rim_radius_m)
+    depths_m = disc_outline(left_from_drogue, centers, radii, _RIM_POINTS)[..., 2]
+    return bool((depths_m > _LEAST_DEPTH_M).all())
+
+
 def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene], source: Path) -> BlindRow:
     fixes = {frame: e for frame, e in estimates.items() if isinstance(e, PoseEstimate)}
-    residuals = [r for frame, e in fixes.items() for r in _residuals_px(e, scenes[frame], source)]
-    views = [
-        (given, rim_box_px(scenes[frame], e.left_from_drogue, eye))
-        for frame, e in fixes.items()
-        for eye, given in scenes[frame].boxes.items()
-    ]
-    inside = [_holds_center(given, rim) for given, rim in views]
+    residuals, inside, overlaps = list[float](), list[bool](), list[float]()
+    for frame, estimate in fixes.items():
+        scene, pose = scenes[frame], estimate.left_from_drogue
+        in_front = _is_in_front(scene, pose)
+        residuals += _residuals_px(estimate, scene, source) if in_front else []
+        for eye, given in scene.boxes.items():
+            rim = rim_box_px(scene, pose, eye) if in_front else None
+            inside.append(rim is not None and _holds_center(given, rim))
+            overlaps.append(0.0 if rim is None else float(intersection_over_union(given, rim)))
     return BlindRow(
         n=len(scenes),
         fixes=len(fixes),
         fix_fraction=len(fixes) / len(scenes),
         residual_rms_px=float(np.sqrt(np.mean(np.square(residuals)))) if residuals else None,
-        boxes=len(views),
-        middle_in_box_fraction=float(np.mean(inside)) if views else None,
-        rim_box_iou_median=float(np.median([intersection_over_union(given, rim) for given, rim in views]))
-        if views
-        else None,
+        boxes=len(inside),
+        middle_in_box_fraction=float(np.mean(inside)) if inside else None,
+        rim_box_iou_median=float(np.median(overlaps)) if overlaps else None,
     )
 
 
 def _residuals_px(estimate: PoseEstimate, scene: BlindScene, source: Path) -> Iterator[float]:
     """Measured minus expected, both coordinates of every feature that the pose was computed from."""
+    layout = marker_layout(scene.drogue)
     for eye in EYES:
         used = [feature for feature in estimate.features if feature.eye == eye and feature.used]
+        try:
+            places = feature_places(layout, used)
+        except ValueError as error:
+            where = f"{source}: method {estimate.method!r}: frame {estimate.frame_index}"
+            raise ValueError(f"{where}: {error}") from error
         expected = marker_images_px(scene, estimate.left_from_drogue, eye)
-        count = len(scene.drogue.marker_positions_m)
-        for feature in used:
-            place = count if feature.index == "hub" else int(feature.index)
-            if not 0 <= place < len(expected):
-                raise ValueError(f"{source}: frame {estimate.frame_index}: feature {feature.index} is not the drogue's")
+        for feature, place in zip(used, places, strict=True):
             yield from (np.array(feature.center_px) - expected[place]).tolist()
 
 
@@ -262,7 +276,9 @@ def _tiles(dataset: Location, estimates: Path, method: str, faults: PairFaults |
         box = scene.boxes.get("left")
         centers: list[tuple[float, float]] = []
         distance_m, caption = 0.0, f"Frame {frame}, no pose"
-        if pose is not None:
+        if pose is not None and not _is_in_front(scene, pose):
+            caption = f"Frame {frame}, pose not in front of the cameras"
+        elif pose is not None:
             box = box or rim_box_px(scene, pose, "left")
             centers = [(float(x), float(y)) for x, y in marker_images_px(scene, pose, "left")]
             distance_m = float(pose.translation_m[2])

@@ -50,7 +50,7 @@ def centroid_errors(truth: DrogueTruth, features: Sequence[Feature]) -> Centroid
     Raises:
         ValueError: a feature that the drogue does not have.
     """
-    places = _places(truth.layout, features)
+    places = feature_places(truth.layout, features)
     measured = np.array([feature.center_px for feature in features], dtype=np.float64).reshape(-1, 2)
     used = np.array([feature.used for feature in features], dtype=np.bool_)
     eye = np.array([EYES.index(feature.eye) for feature in features], dtype=np.intp)
@@ -134,7 +134,12 @@ def position_error_from_centroids(truth: DrogueTruth, errors: CentroidErrors) ->
     return error
 
 
-def _places(layout: MarkerLayout, features: Sequence[Feature]) -> NDArray[np.intp]:
+def feature_places(layout: MarkerLayout, features: Sequence[Feature]) -> NDArray[np.intp]:
+    """(K,) places of measured features among the drogue's: the markers, then the hub.
+
+    Raises:
+        ValueError: a feature that the drogue does not have.
+    """
     for feature in features:
         if feature.index == "hub":
             if layout.hub_center_m is None:
