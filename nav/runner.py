@@ -10,7 +10,7 @@ from datasets_manifest.types.estimates import Estimate, NoFix
 from drogue_models.marker_layout import marker_layout
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 from nav.docking import docking_quantities
-from nav.filtering.roll_decoder import DecodedRoll, turned_to
+from nav.filtering.roll_decoder import DecodedRoll, turned_to, with_own_numbers
 from nav.filtering.smoother import SMOOTHER_SUFFIX, smooth
 from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.method_registry import method_names, pose_method
@@ -61,6 +61,7 @@ class SequenceSmoother:
         if measured.roll_probability is not None:
             roll = DecodedRoll(measured.left_from_drogue, measured.roll_probability)
             smoothed = turned_to(smoothed, pair.drogue, roll)
+        smoothed = with_own_numbers(smoothed, measured, pair.drogue)
         docking = docking_quantities(smoothed, pair.rig, pair.drogue, self._settings.capture_radius_m)
         return smoothed.model_copy(update={"docking": docking, "latency_s": None, "time_s": measured.time_s})
 

@@ -22,7 +22,7 @@ from nav.detector.detector import Detector
 from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
-from nav.filtering.roll_decoder import DecodedRoll, RollDecoder, turned_to, with_decoded_roll
+from nav.filtering.roll_decoder import DecodedRoll, RollDecoder, turned_to, with_decoded_roll, with_own_numbers
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.pair_measurement import PairMeasurement
 from nav.pair_navigator import RIM_METHODS, CentroidChoice, PairNavigator
@@ -264,6 +264,7 @@ class SequenceNavigator:
         docking = docking_quantities(update.state, pair.rig, pair.drogue, self._settings.capture_radius_m)
         estimate = update.state.to_estimate(pair.frame_index, method, measured)
         estimate = estimate if roll is None else turned_to(estimate, pair.drogue, roll)
+        estimate = with_own_numbers(estimate, measured, pair.drogue)
         stage_s = {**measured.stage_s, "filter": perf_counter() - start}
         return estimate.model_copy(update={"docking": docking, "stage_s": stage_s})
 

@@ -56,7 +56,8 @@ class FilterState:
         Args:
             frame_index: of the pair.
             method: full name, such as `joint-hub+filter`.
-            measured: the measured estimate of that pair; its features, regions and times are copied.
+            measured: the measured estimate of that pair; its features, regions and times are copied. Its markers are
+                numbered by its own roll; `nav.filtering.roll_decoder.with_own_numbers` renumbers them by this one's.
         """
         estimate = PoseEstimate(
             frame_index=frame_index,

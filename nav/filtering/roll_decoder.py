@@ -149,18 +149,32 @@ def with_decoded_roll(estimate: Estimate, drogue: DrogueParameters, roll: Decode
     """
     if roll is None or not isinstance(estimate, PoseEstimate):
         return estimate
-    permutations = symmetry_permutations(marker_layout(drogue))
-    turn = steps_to_roll(estimate.left_from_drogue.rotation, roll.left_from_drogue.rotation, len(permutations))
-    new_index = permutations[turn % len(permutations)]
+    return with_own_numbers(turned_to(estimate, drogue, roll), estimate, drogue)
+
+
+def with_own_numbers(estimate: PoseEstimate, measured: PoseEstimate, drogue: DrogueParameters) -> PoseEstimate:
+    """An estimate whose markers are numbered by its own roll.
+
+    Args:
+        estimate: with the markers of the measured one, rolled against it by any number of symmetry angles.
+        measured: of the same pair.
+        drogue: whose markers they are.
+    """
+    layout = marker_layout(drogue)
+    rotations = measured.left_from_drogue.rotation, estimate.left_from_drogue.rotation
+    turn = steps_to_roll(*rotations, layout.symmetry_order) % layout.symmetry_order
+    if turn == 0:
+        return estimate
+    new_index = symmetry_permutations(layout)[turn]
     features = tuple(
         feature if feature.index == "hub" else feature.model_copy(update={"index": int(new_index[feature.index])})
         for feature in estimate.features
     )
-    return turned_to(estimate.model_copy(update={"features": features}), drogue, roll)
+    return estimate.model_copy(update={"features": features})
 
 
 def turned_to(estimate: PoseEstimate, drogue: DrogueParameters, roll: DecodedRoll) -> PoseEstimate:
-    """As `with_decoded_roll`, of a filtered estimate, whose markers have the numbers of the measured one."""
+    """An estimate, measured, filtered or smoothed, turned to the decoded roll; its markers keep their numbers."""
     wanted, order = roll.left_from_drogue.rotation, marker_layout(drogue).symmetry_order
     modes = tuple(
         mode.model_copy(update={"left_from_drogue": nearest_roll(mode.left_from_drogue, wanted, order)})
