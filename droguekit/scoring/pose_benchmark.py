@@ -77,8 +77,8 @@ def score_estimates(
         faults: as for `run_benchmark`.
 
     Raises:
-        ValueError: a record cannot be read, there are no estimates, or they name other pairs than these or one of them
-            twice for a method.
+        ValueError: a record cannot be read, no pair shows a drogue, there are no estimates, or they name other pairs
+            than these or one of them twice for a method.
     """
     indices = data.frame_indices if frame_indices is None else frame_indices
     methods = estimates_by_method(estimates, indices, source)
@@ -89,6 +89,11 @@ def score_estimates(
             continue
         truths[index] = drogue_truth(record)
         states.append(true_state(record))
+    if faults is not None and faults.count and not any(truth is not None for truth in truths.values()):
+        raise ValueError(
+            f"{data.path}: no pair that can be read shows a drogue, so there is nothing to compare poses with: "
+            f"{faults.line()}"
+        )
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(truths))
     return score_methods(facts, truths, methods, true_sequences(states), source)
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.pose_benchmark import run_benchmark, score_methods
@@ -274,6 +275,19 @@ def test_a_feature_that_the_drogue_lacks_is_named(build: SimpleNamespace) -> Non
 def test_a_dataset_without_any_drogue_is_refused(build: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match="no pair shows a drogue"):
         score_records([build.record(0, None)], [build.estimate(0, build.pose(0, 0, 3))])
+
+
+@pytest.mark.parametrize("damaged", [(0,), (0, 1)])
+def test_damaged_pairs_are_named_where_no_other_shows_a_drogue(
+    build: SimpleNamespace, tmp_path: Path, damaged: tuple[int, ...]
+) -> None:
+    folder = build.dataset(tmp_path / "dataset", [build.record(0, build.pose(0.1, 0, 5)), build.record(1, None)])
+    for frame in damaged:
+        (folder / "frames" / f"{frame:06d}" / "record.json").write_text("{")
+    write_estimates(tmp_path / "e.jsonl", [build.estimate(0, build.pose(0, 0, 3))])
+    wanted = r"dataset: no pair that can be read shows a drogue, .*: {} no result .* pair 0: .*000000.record\.json"
+    with pytest.raises(ValueError, match=wanted.format("1 pair has" if len(damaged) == 1 else "2 pairs have")):
+        run_benchmark(folder, tmp_path / "e.jsonl", PairFaults())
 
 
 def test_it_runs_where_no_renderer_is_installed(

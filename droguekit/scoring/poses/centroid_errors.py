@@ -26,7 +26,8 @@ class CentroidErrors:
         offset_px: (K, 2) [px]
         outward_px: (K,) part of the offset that points away from the image of the drogue's middle. [px]
         is_hub, used: (K,) whether the feature is the hub, and whether the pose rests on it.
-        weight: (K,) inverse of the variance that the estimator gives it; all 1 where it gives no proper one. [1/px^2]
+        weight: (K,) smallest variance that the estimator gives a feature over its own; all 1 where it gives one that
+            is no proper variance.
         mistaken: number of measurements that lie farther from their feature than its image is wide, and so belong to
             something else; they are not among the K.
     """
@@ -150,8 +151,11 @@ def feature_places(layout: MarkerLayout, features: Sequence[Feature]) -> NDArray
 
 
 def _weights(features: Sequence[Feature]) -> Array:
-    variances = np.array([(f.cov_px2[0][0] + f.cov_px2[1][1]) / 2 for f in features], dtype=np.float64)
-    weights: Array = 1 / variances if (variances > 0).all() else np.ones(len(features))
+    variances = np.array([f.cov_px2[0][0] / 2 + f.cov_px2[1][1] / 2 for f in features], dtype=np.float64)
+    if not (np.isfinite(variances) & (variances > 0)).all():
+        return np.ones(len(features))
+    # Only ratios count, and the inverse of a very small variance would not be finite.
+    weights: Array = variances.min(initial=np.inf) / variances
     return weights
 
 

@@ -194,19 +194,21 @@ def motion_errors(motion: Motion, truth: TrueMotion) -> Array:
 
 
 def smoothing_spline(times_s: Array, values: Array, period_s: float, knot_s: float = KNOT_S) -> BSpline:
-    """Least-squares cubic spline with evenly spaced knots.
+    """Least-squares cubic spline with as many values from each knot to the next.
 
     Args:
-        times_s: (n,) ascending, without a gap; at least four.
+        times_s: (n,) ascending, without a gap; at least four. [s]
         values: (n, ...) at these.
-        period_s: from one to the next.
+        period_s: from one to the next, about. [s]
         knot_s: about how far knots are apart, a whole number of periods. [s]
     """
     span, step = times_s[-1] - times_s[0], pairs_per_knot(period_s, knot_s)
     # A cubic of that many pieces has three numbers more, and no more than there are values.
     most = min((len(times_s) - 1) // step, len(times_s) - _DEGREE)
     pieces = max(1, min(int(span / (step * period_s) + 0.5), most))
-    inner = np.linspace(times_s[0], times_s[-1], pieces + 1)
+    # Knots at even times would leave a piece without values, and the spline open, where times are uneven.
+    places = np.arange(len(times_s))
+    inner = np.interp(np.linspace(0, places[-1], pieces + 1), places, times_s)
     knots = np.concatenate([[times_s[0]] * _DEGREE, inner, [times_s[-1]] * _DEGREE])
     return make_lsq_spline(times_s, values, knots, k=_DEGREE)
 

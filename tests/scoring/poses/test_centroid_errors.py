@@ -166,3 +166,27 @@ def test_a_shift_is_recovered_from_the_delivered_images_of_lenses(build: SimpleN
     predicted = position_error_from_centroids(truth, centroid_errors(truth, features))
     # A focal length that is 20 % off would make the depth 20 % wrong; the shift's second order is 2e-7.
     np.testing.assert_allclose(predicted, shift, atol=1e-6)
+
+
+@pytest.mark.parametrize("variance_px2", [1e-310, 1e-305, 1e-300, 1e300])
+def test_only_the_ratio_of_the_variances_counts(build: SimpleNamespace, variance_px2: float) -> None:
+    record = build.record(0, build.pose(0.4, -0.2, 6, 4, -7, 3))
+    truth, rng = drogue_truth(record), np.random.default_rng(1)
+    features = build.features(record, lambda: rng.normal(0, 0.05, 2))
+
+    def predicted(scale_px2: float) -> np.ndarray:
+        covariances = [((k * scale_px2, 0.0), (0.0, k * scale_px2)) for k in range(1, len(features) + 1)]
+        given = [f.model_copy(update={"cov_px2": each}) for f, each in zip(features, covariances, strict=True)]
+        return position_error_from_centroids(truth, centroid_errors(truth, given))
+
+    # Rounding; numbers below 2e-308 have fewer digits, at 1e-310 thirteen.
+    np.testing.assert_allclose(predicted(variance_px2), predicted(1.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("variance_px2", [0.0, np.inf])
+def test_measurements_without_proper_variances_weigh_the_same(build: SimpleNamespace, variance_px2: float) -> None:
+    record = build.record(0, build.pose(0.4, -0.2, 6, 4, -7, 3))
+    wrong = ((variance_px2, 0.0), (0.0, variance_px2))
+    first, *others = build.features(record, lambda: (0.1, 0.1))
+    errors = centroid_errors(drogue_truth(record), [first.model_copy(update={"cov_px2": wrong}), *others])
+    assert errors.weight.tolist() == [1.0] * 18

@@ -200,6 +200,17 @@ def test_a_spline_has_no_more_numbers_than_values(count: int, period_s: float) -
     assert len(spline.c) <= count
 
 
+def test_values_at_uneven_times_determine_the_spline(rng: np.random.Generator) -> None:
+    """Steps within the rule of gaps may leave a piece without a value of its own."""
+    for _ in range(500):
+        steps_s = 0.17 * rng.uniform(0.05, 1.49, rng.integers(9, 60))
+        times_s = np.concatenate([[0.0], np.cumsum(steps_s)])
+        cubic = np.polynomial.Polynomial([0.3, -1.0, 0.5, 0.2])(times_s / times_s[-1])
+        spline = smoothing_spline(times_s, cubic, float(np.percentile(steps_s, 50, method="lower")), 0.16)
+        # A cubic is a spline of any knots: rounding.
+        np.testing.assert_allclose(spline(times_s), cubic, atol=1e-9)
+
+
 def test_the_period_is_one_of_the_steps(build: SimpleNamespace) -> None:
     """Of three pairs the middle of two steps is no step, where one is a gap."""
     records = build.sequence(build.swinging, 3)
