@@ -42,7 +42,7 @@ def docking_quantities(
     that hose and air add until contact.
 
     Args:
-        state: of a filter, or an estimate; an estimate without motion gives the position only.
+        state: of a filter, or an estimate; without a known motion it gives the position only.
         rig: with the probe's tip.
         drogue: its capture radius and dimensions.
         capture_m: capture radius; None for `capture_radius_m` of the drogue. [m]
@@ -96,7 +96,7 @@ def _covariance(state: FilterState | PoseEstimate) -> Array | None:
 
 def _velocity(state: FilterState | PoseEstimate) -> Array | None:
     if isinstance(state, FilterState):
-        return state.velocity_m_s
+        return state.velocity_m_s if state.motion_known else None
     return None if state.motion is None else np.array(state.motion.velocity_m_s)
 
 

@@ -118,7 +118,7 @@ class PoseEstimate(FrozenModel):
         features: the measured image points.
         stage_s: computing time by stage. [s]
         regions: search regions, at most one an eye.
-        motion: as estimated by a filter, or None.
+        motion: as estimated by a filter from two measurements or more, or None.
         docking: where it was requested.
         latency_s: from the arrival of the images to this result, in real time. [s]
         time_s: of the images, in real time. [s]

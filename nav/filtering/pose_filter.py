@@ -35,6 +35,7 @@ class FilterState:
             `datasets_manifest.types.estimates`. [m, rad, m/s, rad/s]
         modes: the poses of all hypotheses, the most likely first.
         coasted_s: time since the last measurement. [s]
+        motion_known: whether more than one measurement shows the motion; else velocity and rate are those assumed.
     """
 
     time_s: float
@@ -44,6 +45,7 @@ class FilterState:
     covariance: Array
     modes: tuple[Mode, ...] = ()
     coasted_s: float = 0.0
+    motion_known: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "velocity_m_s", read_only(self.velocity_m_s, (3,), "velocity_m_s"))
@@ -51,7 +53,7 @@ class FilterState:
         object.__setattr__(self, "covariance", read_only(self.covariance, (12, 12), "covariance"))
 
     def to_estimate(self, frame_index: int, method: str, measured: Estimate | None = None) -> PoseEstimate:
-        """The state as an estimate of a pair.
+        """The state as an estimate of a pair, without a motion that is not known.
 
         Args:
             frame_index: of the pair.
@@ -59,25 +61,26 @@ class FilterState:
             measured: the measured estimate of that pair; its features, regions and times are copied. Its markers are
                 numbered by its own roll; `nav.filtering.roll_decoder.with_own_numbers` renumbers them by this one's.
         """
+        motion = Motion(
+            velocity_m_s=tuple(self.velocity_m_s.tolist()),
+            rate_rad_s=tuple(self.rate_rad_s.tolist()),
+            covariance=self.covariance[_POSE:, _POSE:],
+        )
         estimate = PoseEstimate(
             frame_index=frame_index,
             method=method,
             left_from_drogue=self.left_from_drogue,
             covariance=self.covariance[:_POSE, :_POSE],
             modes=self.modes,
-            motion=Motion(
-                velocity_m_s=tuple(self.velocity_m_s.tolist()),
-                rate_rad_s=tuple(self.rate_rad_s.tolist()),
-                covariance=self.covariance[_POSE:, _POSE:],
-            ),
+            motion=motion if self.motion_known else None,
         )
         if measured is None:
             return estimate
         return estimate.model_copy(update={name: getattr(measured, name) for name in _MEASURED_FIELDS})
 
 
-def summarize_bank(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
-    """The most likely hypothesis; its covariance is the mixture's second moment about it."""
+def summarize_bank(bank: Bank, time_s: float, coasted_s: float, measurements: int) -> FilterState:
+    """The most likely hypothesis of so many measurements; its covariance is the mixture's second moment about it."""
     best = bank[0].state
     return FilterState(
         time_s=time_s,
@@ -87,6 +90,7 @@ def summarize_bank(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
         covariance=bank_covariance(bank),
         modes=_modes(bank),
         coasted_s=coasted_s,
+        motion_known=measurements > 1,
     )
 
 
@@ -208,7 +212,7 @@ def predict(tracker_state: TrackerState, time_s: float, settings: FilterSettings
         return None
     # Most calls ask for the time of the last measurement, which needs no propagation.
     bank = propagate_bank(track.bank, coasted_s, settings) if coasted_s > 0 else track.bank
-    return summarize_bank(bank, time_s, coasted_s)
+    return summarize_bank(bank, time_s, coasted_s, track.measurements)
 
 
 def _start_track(time_s: float, measurement: PoseMeasurement, settings: FilterSettings) -> Track:

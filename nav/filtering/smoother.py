@@ -57,7 +57,8 @@ def smooth(
         banks = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
         for index, bank in enumerate(_backward_pass(banks), start=first):
             coasted_s = float(np.abs(times[members] - times[index]).min())
-            state, estimate = summarize_bank(bank, float(times[index]), coasted_s), estimates[index]
+            state = summarize_bank(bank, float(times[index]), coasted_s, len(members))
+            estimate = estimates[index]
             smoothed[index] = state.to_estimate(estimate.frame_index, _name(estimate), estimate)
     return smoothed
 

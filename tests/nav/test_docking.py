@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -117,6 +119,13 @@ def test_an_estimate_tells_what_it_knows() -> None:
     assert still is not None and still.closure_m_s is None and still.miss_m is None
     bare = PoseEstimate(frame_index=0, method="paper", left_from_drogue=estimate.left_from_drogue)
     assert docking_quantities(bare, RIG, DROGUE) is None
+
+
+def test_a_motion_that_is_not_known_leads_to_no_contact() -> None:
+    state = replace(_state(_ahead_of_tip([0.1, 0.0, 3.0]), np.array([0, 0, -0.6])), motion_known=False)
+    docking = docking_quantities(state, RIG, DROGUE)
+    assert docking is not None and docking.mouth_from_tip_m == pytest.approx((3.0, 0.1, 0.0))
+    assert docking.closure_m_s is docking.contact_s is docking.miss_m is docking.captured is None
 
 
 def test_capture_radius() -> None:

@@ -180,6 +180,17 @@ def test_filtered_and_smoothed_estimates_tell_of_motion_and_docking(
         assert last.docking.captured is captured
 
 
+def test_one_fix_tells_neither_motion_nor_closure(steady: list[BlindPair]) -> None:
+    settings = SequenceSettings(("joint-hub",), filtered=True, smoothed=True)
+    # One pair alone, and two that begin another sequence.
+    found, _ = answers_by_method(restamped(steady[:3], [0.0, 10.0, 10.04]), settings)
+    for suffix, known in (("+filter", [False, False, True]), ("+smoother", [False, True, True])):
+        for estimate, knows in zip(found[f"joint-hub{suffix}"], known, strict=True):
+            assert (estimate.motion is not None) is knows
+            assert (estimate.docking.closure_m_s is not None) is knows
+            assert estimate.docking.mouth_from_tip_m[0] > 0
+
+
 def test_a_filter_of_a_method_without_covariance_says_so(steady: list[BlindPair]) -> None:
     found, _ = answers_by_method(steady[:2], SequenceSettings(("mean-plane",), filtered=True))
     assert isinstance(found["mean-plane"][0], PoseEstimate)

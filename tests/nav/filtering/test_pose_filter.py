@@ -289,6 +289,17 @@ def test_covariances_stay_valid_over_ten_thousand_fixes(
             np.testing.assert_allclose(update.state.covariance, update.state.covariance.T)
 
 
+def test_motion_is_known_from_the_second_fix_on(measure: Measure, covariance: np.ndarray) -> None:
+    fixes, pose = PoseFilter(FilterSettings(max_coast_s=1.0), ORDER), RigidTransform(np.eye(3), np.array([0, 0, 5.0]))
+    # The third fix is the first after a gap.
+    for time_s, known in ((0.0, False), (0.04, True), (2.0, False), (2.04, True)):
+        state = fixes.update(time_s, measure(pose, covariance)).state
+        later = fixes.predict(time_s + 0.01)
+        assert state is not None and later is not None
+        assert state.motion_known is later.motion_known is known
+        assert (state.to_estimate(0, "joint+filter").motion is not None) is known
+
+
 def test_a_state_becomes_an_estimate(measure: Measure, covariance: np.ndarray) -> None:
     state = _flown(measure, covariance).predict(1.6)
     assert state is not None
