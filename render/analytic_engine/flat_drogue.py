@@ -1,4 +1,8 @@
-"""The drogue as flat rings: their outlines in the image of each eye, and the light that they send to the camera."""
+"""The drogue as flat rings: their outlines in the image of each eye, and the light that they send to the camera.
+
+The rim is the flat equator of its tube. The tube's own outline lies nearer to the cameras, so near poses from the rim's
+edge are off on these images: see `joint-rim` in docs/reference/methods.md.
+"""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ import pytest
 
 from drogue_models.marker_layout import MarkerLayout, RimOutline, marker_layout
 from drogue_models.presets import load_drogue
-from geometry.circles import project_disc_centers
-from geometry.se3 import RigidTransform
+from geometry.circles import disc_outline, project_disc_centers
+from geometry.se3 import RigidTransform, exp_rotation
 from geometry.stereo import EYES, StereoRig, paper_rig
 from nav.pose.joint_rim import EDGE_SHIFT_SD_PX, ROLL_SD_RAD, joint_rim, outline_points, rim_bound
 from nav.pose.pose_method import NoFixReason, Observation, RimEdges, Solution
@@ -100,6 +100,24 @@ def test_exact_points_give_the_pose_without_its_roll(z_m: float, angles_deg: tup
     assert found.translation_m == pytest.approx(pose.translation_m, abs=1e-6 * z_m)
     assert found.rotation[:, 2] == pytest.approx(pose.rotation[:, 2], abs=1e-5)
     assert found.rotation[1, 0] == 0
+
+
+@pytest.mark.parametrize(("z_m", "error_m", "sd_m"), [(1.7, 1.1e-3, 2e-5), (2.8, 7e-4, 8e-5), (4.7, 4e-4, 2.8e-4)])
+def test_a_rim_that_is_drawn_flat_looks_farther_than_its_tube(z_m: float, error_m: float, sd_m: float) -> None:
+    """The analytic engine draws it so; docs/reference/methods.md has these figures."""
+    rim, pose = marker_layout(load_drogue("red-8")).rim, make_pose(0.06, 0, z_m, 5.7, 2.9)
+    assert rim is not None
+    # Points 6 px apart, as the edge is measured.
+    count = int(2 * np.pi * rim.radius_m * RIG.camera.fx_px / z_m / 6)
+    edges = draw_edges(pose, 0.02, None, rim, count)
+    # As many points of the flat circle, from where the edge's begin.
+    begin = RigidTransform(exp_rotation(np.array([0, 0, 2 * np.pi * 0.3 / count])), np.zeros(3))
+    circle_m = disc_outline(pose @ begin, [0, 0, rim.tube_radius_m], rim.radius_m, count)
+    places = np.concatenate([RIG.project(circle_m, eye) for eye in EYES])
+    solution = solve(replace(edges, points_px=places), rim)
+    # To the last digit of the figures.
+    assert solution.left_from_drogue.translation_m[2] - z_m == pytest.approx(error_m, abs=6e-5)
+    assert np.sqrt(solution.covariance[2, 2]) == pytest.approx(sd_m, rel=0.15)
 
 
 def test_the_roll_is_stated_as_open() -> None:
