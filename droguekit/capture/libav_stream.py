@@ -115,7 +115,10 @@ class LibavStream:
             is_unstamped = self._is_unstamped(container)
             cleanness = _Cleanness()
             for packet, arrived_s in self._packets(container, stop, left_out, cleanness):
-                for frame in self._frames(packet, left_out, cleanness):
+                frames = self._frames(packet, left_out, cleanness)
+                # The last packet gives several images; the wait for the time of each is no decoding.
+                decode_s = self._clock.now_s() - arrived_s
+                for frame in frames:
                     self._check_frame(frame)
                     if not cleanness.accepts(frame):
                         left_out[DAMAGED] += 1
@@ -123,7 +126,6 @@ class LibavStream:
                         left_out[UNSTAMPED] += 1
                     else:
                         time_s = arrived_s if is_unstamped else float(frame.pts * frame.time_base)
-                        decode_s = self._clock.now_s() - arrived_s
                         yield CapturedImage(
                             self._view, time_s, arrived_s, decode_s, partial(pixels_of_frame, frame, self.name)
                         )

@@ -176,7 +176,8 @@ def open_source(text: str, settings: CaptureSettings, rig: StereoRig, clock: Clo
     parts = text.split(",")
     if len(parts) == 2 and "://" not in text and not Path(text).exists():
         places = [libav_place(part, (width_px, height_px), settings.timeout_s, *asked) for part in parts]
-        if any(place.format is None for place in places) or places[0] == places[1]:
+        one, other = (Path(place.url).resolve() for place in places)
+        if any(place.format is None for place in places) or one == other:
             raise ValueError(
                 f"--live: two views must come from two devices, whose time stamps are of one clock, got {text!r}; "
                 "join streams side by side, or use topics of ROS 2"

@@ -162,7 +162,8 @@ class VideoPlayback:
         """See `StereoSource`."""
         self._stream.open()
         loader, offset_s = _PairLoader(self._left_out), None
-        for image in _ascending(self._stream.images(self._stop, self._left_out), self._left_out):
+        images = self._stream.images(self._stop, self._left_out)
+        for image in _ascending(images, lambda: self._left_out.update([NOT_NEWER])):
             pair = loader.load((image,), self._clock)
             if pair is None:
                 continue
@@ -236,7 +237,7 @@ class RunningCamera:
             stream.open()
             with self._changed:
                 self._opened += 1
-            for image in _ascending(stream.images(self._stop, left_out), left_out):
+            for image in _ascending(stream.images(self._stop, left_out), self._drop):
                 self._put(image, left_out)
         except Exception as fault:  # every fault of this thread belongs to the caller's
             error = fault
@@ -244,6 +245,10 @@ class RunningCamera:
             self._count(left_out)
             self._ended, self._error = True, self._error or error
             self._changed.notify_all()
+
+    def _drop(self) -> None:
+        with self._changed:
+            self._unread[NOT_NEWER] += 1
 
     def _put(self, image: CapturedImage, left_out: Counter[str]) -> None:
         with self._changed:
@@ -260,7 +265,7 @@ class RunningCamera:
 
     def _paired(self) -> Iterator[CapturedPair]:
         pairing, loader = StampPairing(self._tolerance_s, self._unpaired), _PairLoader(self._unpaired)
-        last_s, seen = self._clock.now_s(), 0
+        last_s, seen, dropped = self._clock.now_s(), 0, 0
         while not self._stop.is_set():
             image = self._take()
             if image is None:
@@ -272,10 +277,12 @@ class RunningCamera:
                 pair = None if views is None else loader.load(views, self._clock)
                 if pair is not None:
                     yield pair
-                    last_s, seen = self._clock.now_s(), 0
+                    last_s, seen, dropped = self._clock.now_s(), 0, self.left_out[NOT_NEWER]
             if self._clock.now_s() - last_s > self._timeout_s:
+                stuck = self.left_out[NOT_NEWER] - dropped
+                told = f"; {stuck} images came whose time stamps do not advance" if stuck else pairing.advice()
                 raise ValueError(
-                    f"{self.name}: no {'pair' if seen else 'image'} came for {self._timeout_s:g} s{pairing.advice()}"
+                    f"{self.name}: no {'pair' if seen or stuck else 'image'} came for {self._timeout_s:g} s{told}"
                 )
 
     def _take(self) -> CapturedImage | None:
@@ -396,12 +403,12 @@ def _part(image: LoadedImage, columns: slice) -> LoadedImage:
     return LoadedImage(np.ascontiguousarray(image.pixels[:, columns]), mosaic)
 
 
-def _ascending(images: Iterator[CapturedImage], left_out: Counter[str]) -> Iterator[CapturedImage]:
-    """Images whose stamps are newer than those before of the same view."""
+def _ascending(images: Iterator[CapturedImage], drop: Callable[[], None]) -> Iterator[CapturedImage]:
+    """Images whose stamps are newer than those before of the same view; `drop` is called for each of the others."""
     newest_s: dict[int | None, float] = {}
     for image in images:
         if image.time_s <= newest_s.get(image.view, -np.inf):
-            left_out[NOT_NEWER] += 1
+            drop()
             continue
         newest_s[image.view] = image.time_s
         yield image

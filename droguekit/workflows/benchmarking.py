@@ -219,13 +219,15 @@ def _runs(
 
 def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
     """Run a detector on all images."""
+    from droguekit.numerical_threads import one_thread
     from droguekit.scoring.detection.detection_scores import DetectorOutput
     from droguekit.scoring.detection.detector_runner import LEAST_SCORE
 
     report.say(f"{detecting.name}: detecting the drogue, without the truth")
     report.begin("pairs", detecting.pairs)
     try:
-        boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
+        with one_thread():
+            boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
     finally:
         report.end()
     cost = _network_cost(name_or_file, detecting.pass_sizes_px)

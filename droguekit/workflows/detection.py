@@ -184,6 +184,7 @@ def detect_dataset(
         ValueError: no such dataset, detector or tracker, a score outside 0 to 1, or no pair without a fault.
         OSError: the file cannot be written; it stays as it was.
     """
+    from droguekit.numerical_threads import one_thread
     from droguekit.scoring.detection.detector_runner import DetectorRunner
     from droguekit.scoring.results.detection_result import write_detections
     from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
@@ -205,7 +206,8 @@ def detect_dataset(
 
     report.begin("pairs", detecting.pairs)
     try:
-        found = list(counted())
+        with one_thread():
+            found = list(counted())
     finally:
         report.end()
     times = detecting.times()

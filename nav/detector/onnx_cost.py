@@ -27,7 +27,7 @@ def network_cost(file: Path, size_px: tuple[int, int]) -> NetworkCost:
         size_px: width and height of the input.
 
     Raises:
-        ValueError: no such file, not a network, or an operation whose shape cannot be inferred.
+        ValueError: no such file, not a network, or an operation that is not counted or whose shape cannot be inferred.
     """
     import onnx
 
@@ -52,17 +52,34 @@ def network_cost(file: Path, size_px: tuple[int, int]) -> NetworkCost:
         each.name: [d.dim_value for d in each.type.tensor_type.shape.dim] for each in (*graph.value_info, *graph.output)
     }
     weights = {each.name: list(each.dims) for each in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Constant":
+            constant = [list(each.t.dims) for each in node.attribute if each.name == "value"]
+            weights |= dict(zip(node.output, constant, strict=False))
+        elif node.op_type in _SAME_NUMBERS and node.input[0] in weights:
+            weights[node.output[0]] = weights[node.input[0]]
     products = sum(_products(node, shapes, weights) for node in graph.node)
     layers = {name for node in graph.node if node.op_type in _LAYERS for name in node.input if name in weights}
     return NetworkCost(sum(math.prod(weights[name]) for name in layers), 2e-9 * products / 2)
 
 
-_LAYERS = ("Conv", "ConvTranspose", "Gemm", "MatMul", "BatchNormalization")
+_COUNTED = ("Conv", "Gemm", "MatMul")
+_LAYERS = (*_COUNTED, "BatchNormalization")
+# Of a weight these change its type at most.
+_SAME_NUMBERS = ("Identity", "QuantizeLinear", "DequantizeLinear")
+_NOT_COUNTED = frozenset(
+    {
+        *("ConvTranspose", "ConvInteger", "QLinearConv", "DeformConv", "MatMulInteger", "QLinearMatMul", "Einsum"),
+        *("Attention", "LSTM", "GRU", "RNN"),
+    }
+)
 
 
 def _products(node: Any, shapes: dict[str, list[int]], weights: dict[str, list[int]]) -> int:
     """Number of multiplications of a node for a batch of two."""
-    if node.op_type not in ("Conv", "Gemm", "MatMul"):
+    if node.op_type in _NOT_COUNTED:
+        raise ValueError(f"{node.op_type} {node.name!r}: its multiplications are not counted")
+    if node.op_type not in _COUNTED:
         return 0
     out = shapes.get(node.output[0], [])
     weight = weights.get(node.input[1], shapes.get(node.input[1], []))

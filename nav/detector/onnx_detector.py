@@ -265,6 +265,8 @@ def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[s
     if shape[0] == 1:
         raise ValueError(f"{file}: takes one image a pass, must take both eyes; export it with a dynamic batch")
     width, height = shape[3], shape[2]
+    if isinstance(width, int) != isinstance(height, int):
+        raise ValueError(f"{file}: width and height must both be fixed or both dynamic, got {width}x{height}")
     if not (isinstance(width, int) and isinstance(height, int)):
         return inputs[0].name, None
     if width % SIZE_STEP_PX or height % SIZE_STEP_PX:

@@ -272,7 +272,9 @@ def _processed(rng: np.random.Generator, image: Image) -> Image:
     """Resample, sharpen and compress some images."""
     if rng.random() < _RESAMPLED_FRACTION:
         scale, size = rng.uniform(*_RESAMPLED_SCALE), image.shape[1::-1]
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        # With a factor in place of a size, OpenCV would not take the whole picture, and boxes would be off.
+        small_size = [max(1, round(scale * side)) for side in size]
+        small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
         image = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
     if rng.random() < _SHARPENED_FRACTION:
         amount = rng.uniform(*_SHARPENED_AMOUNT)
@@ -324,12 +326,14 @@ def _darken(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _motion_blur(rng: np.random.Generator, image: Image) -> Image:
-    """Blur the image along a straight line, as motion does."""
+    """Blur the image along a straight line, as motion does, without moving it."""
     length_px = int(rng.integers(_MOTION_PX[0], _MOTION_PX[1] + 1))
-    kernel = np.zeros((length_px, length_px))
-    middle, angle = (length_px - 1) / 2, rng.uniform(0, np.pi)
-    for t in np.linspace(-middle, middle, 4 * length_px):
-        kernel[round(middle + t * np.sin(angle)), round(middle + t * np.cos(angle))] = 1
+    reach, angle = length_px // 2, rng.uniform(0, np.pi)
+    half_px, middle = (length_px - 1) / 2, reach
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for t in np.linspace(-half_px, half_px, 4 * length_px):
+        row, column = round(t * np.sin(angle)), round(t * np.cos(angle))
+        kernel[middle + row, middle + column] = kernel[middle - row, middle - column] = 1
     return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), dtype=np.uint8)
 
 

@@ -284,11 +284,15 @@ def _in_input(placement: Letterbox, box: PixelBox) -> PixelBox:
 
 @dataclass(frozen=True)
 class DatasetStamp:
-    """Name and hashes that identify a dataset; one of photographs has no manifest, and an empty hash of it."""
+    """What identifies a dataset, and how many of its pairs can be read.
+
+    Photographs have no manifest, and an empty hash of it.
+    """
 
     name: str
     dataset_sha256: str
     manifest_sha256: str
+    pairs: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,11 +406,11 @@ def open_corpus(
         if not has_boxes and not _is_without_drogue(dataset):
             raise ValueError(f"{dataset.path}: shows no drogue in any image; there is nothing to learn from")
     stamps = tuple(
-        DatasetStamp(dataset.manifest.name, dataset.manifest.dataset_sha256, dataset.manifest.manifest_sha256)
-        for dataset in datasets
+        DatasetStamp(manifest.name, manifest.dataset_sha256, manifest.manifest_sha256, len(images.pairs))
+        for manifest, images in zip((dataset.manifest for dataset in datasets), caches, strict=True)
     )
     if without is not None:
-        stamps += (DatasetStamp(_PHOTOGRAPHS, without.sha256, ""),)
+        stamps += (DatasetStamp(_PHOTOGRAPHS, without.sha256, "", len(without.images)),)
     places = [(number, index) for number, cache_ in enumerate(caches) for index in range(len(cache_.pairs))]
     corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault, without)
     if not any(len(corpus.boxes(pair, eye)) for pair in corpus.split("train") for eye in (0, 1)):

@@ -27,6 +27,7 @@ from geometry.boxes import intersection_over_union
 from nav.detector.coarse_to_fine import FINE_SCALE, SecondLook, detect_again
 from nav.detector.input_image import PADDING_DN
 from nav.detector.multiscale_inference import detect_multiscale
+from nav.detector.output_maps import MAX_SIDE_PX
 from nav.training.augmentation import Boxes, Image, paint_view, whole_view
 from nav.training.corpus import Corpus
 from nav.training.prefetch_map import prefetch_map
@@ -169,7 +170,7 @@ def predict(
     for group, whole in zip(groups, prefetch_map(read, groups, threads=1, ahead=2), strict=True):
         images, boxes = zip(*whole, strict=True)
         some = detect_multiscale(images, run, search.large_from_px, _MIN_SCORE, MAX_BOXES)
-        if search.small_below_px:
+        if search.small_below_px and max(fine_size_px) <= MAX_SIDE_PX:
             fine = [partial(fine_image, pair, eye) for pair, eye in group]
             some = detect_again(some, fine, run, look, _MIN_SCORE, MAX_BOXES)
         found += some

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from math import cos, pi
 from pathlib import Path
 from typing import NamedTuple
@@ -413,6 +414,8 @@ class Trainer:
         stage = int(settings.final_size_px is not None and size == settings.final_size_px)
         validated = [row.image_passes // settings.batch_images for row in state.rows if row.ap is not None]
         is_due = is_validation_due(settings, state.step, epoch, validated[-1] if validated else 0)
+        # The last one also fits the batch statistics.
+        is_due = is_due and (self._can_validate or state.step >= settings.steps)
         validation = self._validate(state, size) if is_due else None
         row = self._row(state, epoch, validation)
         state.rows.append(row)
@@ -425,6 +428,11 @@ class Trainer:
         self._save(state)
         left_s = (settings.steps - state.step) * per_step_s
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
+
+    @cached_property
+    def _can_validate(self) -> bool:
+        """Whether the split `val` shows a drogue, without which there is no average precision."""
+        return any(len(self.corpus.boxes(pair, eye)) for pair in self.corpus.split("val") for eye in (0, 1))
 
     def _validate(self, state: TrainingState, size: SizePx) -> ValidationScores | None:
         network = state.average.network

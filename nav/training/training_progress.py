@@ -89,7 +89,7 @@ class TensorBoardCurves:
         """Continue after `image_passes` images; later points, of a run that was killed, are hidden."""
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer: Any = SummaryWriter(str(out / TENSORBOARD_FOLDER), purge_step=image_passes)
+        self._writer: Any = SummaryWriter(str(out / TENSORBOARD_FOLDER), purge_step=image_passes + 1)
 
     def add_step(self, image_passes: int, loss: float, score: float, box: float, learning_rate: float) -> None:
         """Add one step's point to each curve."""

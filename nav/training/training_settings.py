@@ -122,6 +122,14 @@ class TrainingSettings(FrozenModel):
                 )
             if size is not None and max(size) > MAX_SIDE_PX:
                 raise ValueError(f"{name}: must be at most {MAX_SIDE_PX} px a side, got {size_text(size)}")
+        last = self.final_size_px or self.size_px
+        # Images are cached at the larger size. Bars for its shape would stay in a smaller one of another shape, where
+        # the exported network sees none.
+        if self.largest_size_px != last and self.size_px[0] * last[1] != self.size_px[1] * last[0]:
+            raise ValueError(
+                f"final_size_px: must have the shape of the larger size_px {size_text(self.size_px)}, "
+                f"got {size_text(last)}"
+            )
         if self.views == "both" and self.batch_images % 2:
             raise ValueError(f"batch_images: must be even for both views at once, got {self.batch_images}")
         return self

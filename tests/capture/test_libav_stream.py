@@ -169,3 +169,26 @@ def test_a_file_with_two_streams_without_stamps_or_turned_is_refused(tmp_path: P
 )
 def test_a_password_is_not_printed(address: str, printed: str) -> None:
     assert without_password(address) == printed
+
+
+def test_the_wait_between_the_last_images_is_no_decoding(tmp_path: Path) -> None:
+    """Playback takes an image and waits; a decoder of pictures that depend on later ones gives the last all at once."""
+
+    class Counted:
+        """A clock that only the player moves."""
+
+        time_s = 0.0
+
+        def now_s(self) -> float:
+            return self.time_s
+
+    clock, images = Counted(), moving(3)
+    encode(tmp_path / "flight.mkv", images, Codec("matroska", "libx264rgb", "rgb24", {"bf": "3"}))
+    path = str(tmp_path / "flight.mkv")
+    stream = LibavStream(LibavPlace(path, path, is_file=True), None, clock)
+    stream.open()
+    read_s = []
+    for each in stream.images(threading.Event(), Counter()):
+        read_s.append(each.decode_s)
+        clock.time_s += 0.1
+    assert len(read_s) == len(images) and max(read_s) == 0.0

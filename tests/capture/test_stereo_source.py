@@ -93,6 +93,23 @@ def test_pairs_that_never_come_are_explained_after_the_time_limit() -> None:
         next(camera.pairs())
 
 
+class Unstamped(Listed):
+    """A stream that gives its last image again and again, as drivers do that stamp none."""
+
+    def images(self, stop: threading.Event, left_out: Counter[str]) -> Iterator[CapturedImage]:
+        yield from self._images
+        while not stop.wait(1e-3):
+            yield self._images[-1]
+
+
+def test_images_whose_stamps_stand_still_are_told() -> None:
+    camera = RunningCamera("one", [Unstamped("one", [image(None, 0.0)])], MonotonicClock(), 0.3, 0.001)
+    pairs = camera.pairs()
+    assert next(pairs).time_s == 0.0
+    with pytest.raises(ValueError, match=r"^one: no pair came for 0.3 s; \d+ images came whose time stamps do not adv"):
+        next(pairs)
+
+
 def test_a_damaged_image_is_left_out_and_the_first_one_refused() -> None:
     def broken() -> LoadedImage:
         raise ValueError("camera: is truncated")

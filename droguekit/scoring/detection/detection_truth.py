@@ -20,10 +20,12 @@ from droguekit.scoring.blind_check import blind_scenes
 from droguekit.scoring.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
 from droguekit.scoring.results.detection_result import DetectedBox, clipped_box, corner_box, image_id_of
 from droguekit.scoring.sequences.sequence_truth import TrueSequence, true_sequences, true_state
+from geometry.boxes import intersection_over_union
 from geometry.stereo import EYES, Eye
 
-# A box of which at least this share lies in an ignored drogue's box belongs to it: COCO's rule for crowds at IoU 0.5.
-_LEAST_SHARE_INSIDE = 0.5
+# A box of which at least this share lies in an ignored drogue's box belongs to it, unless it overlaps one that is to be
+# found by as much: COCO's rules for crowds at IoU 0.5.
+_LEAST_SHARE_INSIDE = _LEAST_OVERLAP = 0.5
 # Longer side of another tanker's drogue over the image's height. The seed paper's camera sees 0.036 of it at 40 m, the
 # farthest that a drogue is sought.
 _LEAST_OTHER_SIDE_FRACTION = 0.025
@@ -150,11 +152,14 @@ def scored_boxes(images: Sequence[ImageTruth], found: Sequence[DetectedBox]) -> 
 
 
 def _is_ignored(box: DetectedBox, image: ImageTruth) -> bool:
-    """Whether at least half of a box lies in the box of an ignored drogue."""
+    """Whether at least half of a box lies in the box of an ignored drogue, and it is on none that is to be found."""
     regions = (
         image.ignored_others_xywh if image.ignored_xywh is None else (image.ignored_xywh, *image.ignored_others_xywh)
     )
-    return any(_lies_in(box.box_xywh, region) for region in regions)
+    if not any(_lies_in(box.box_xywh, region) for region in regions):
+        return False
+    sought = image.others_xywh if image.box_xywh is None else (image.box_xywh, *image.others_xywh)
+    return not any(intersection_over_union(box.box_xywh, each) >= _LEAST_OVERLAP for each in sought)
 
 
 def _lies_in(box_xywh: PixelBox, region: PixelBox) -> bool:

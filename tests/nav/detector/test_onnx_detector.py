@@ -120,6 +120,7 @@ def test_a_network_of_fixed_size_needs_no_metadata(tmp_path: Path) -> None:
         ({"metadata": METADATA, "strides": (4, 8, 16)}, "outputs must be maps of numbers"),
         ({"metadata": METADATA, "shape": (1, 3, 256, 320)}, "takes one image a pass"),
         ({"metadata": METADATA, "shape": ("b", 3, 250, 320)}, "must be multiples of 32, got 320x250"),
+        ({"metadata": METADATA, "shape": ("b", 3, 256, "w")}, "must both be fixed or both dynamic, got wx256"),
         ({"metadata": METADATA, "shape": ("b", 3, 32, 32_000)}, "must be at most 4096, got 32000x32"),
         (
             {"metadata": METADATA, "shape": ("b", 1, "h", "w")},

@@ -160,3 +160,14 @@ def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
     plain = predict(network, ellipse_corpus, "train", Search(size_px, 5, 0.0), compute)
     differ = [not np.array_equal(one, other) for (_, one), (_, other) in zip(seen.found, plain.found, strict=True)]
     assert any(differ) == (small_below_px > 0)
+
+
+def test_inputs_too_large_to_be_enlarged_are_searched_once(ellipse_corpus: Corpus) -> None:
+    """As the exported detector searches them: boxes of twice the size would exceed the largest input."""
+    network, compute = BrightCells().eval(), ComputeDevice(torch.device("cpu"), bf16=False)
+    plain, again = (
+        predict(network, ellipse_corpus, "train", Search((96, 2080), 4, 0.0, small_px), compute)
+        for small_px in (0.0, 80.0)
+    )
+    for one, other in zip(plain.found, again.found, strict=True):
+        np.testing.assert_array_equal(one[1], other[1])

@@ -26,19 +26,21 @@ from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
 from nav.training.evaluation import (
     Search,
+    ValidationScores,
     average_precision,
     measure_batch_statistics,
     predict,
     to_tensor,
     whole_image,
 )
-from nav.training.trainer import Batch, BatchMaker, is_validation_due
+from nav.training.trainer import Batch, BatchMaker, Trainer, is_validation_due
 from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import (
     BEST_FILE,
     CHECKPOINT_FILE,
     ComputeDevice,
+    TrainingState,
     limit_threads,
     load_checkpoint,
     new_network,
@@ -148,6 +150,21 @@ def test_a_long_training_is_validated_twenty_times_at_most(final_size_px: tuple[
     assert due == ([1, 2, 3, 4, 5, 6] if final_size_px is None else [3, 4, 5, 6])
 
 
+def test_without_a_drogue_to_validate_with_only_the_end_is_validated(
+    toy_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, validate = [], Trainer._validate
+
+    def counted(trainer: Trainer, state: TrainingState, size_px: tuple[int, int]) -> ValidationScores | None:
+        done.append(state.step)
+        return validate(trainer, state, size_px)
+
+    monkeypatch.setattr(Trainer, "_validate", counted)
+    # Three epochs of 80 images.
+    run(toy_dataset, tmp_path, image_passes=240)
+    assert done == [60]
+
+
 def test_a_process_that_is_killed_ends_the_training_in_one_line(split_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, "image_passes": 4000, "loader_workers": 2})
 
@@ -247,7 +264,7 @@ def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, t
 @pytest.mark.slow
 def test_several_datasets_have_no_hash_of_one(split_dataset: Path, tmp_path: Path) -> None:
     second = render_toy(tmp_path / "second", seed=6, frames={"count": 2, "scenes": 1, "empty_fraction": None})
-    changes = {"image_passes": 4, "final_size_px": (64, 96), "final_fraction": 0.5}
+    changes = {"image_passes": 4, "final_size_px": (192, 256), "final_fraction": 0.5}
     settings, out = build_settings(None, {**SMALL, **changes}), tmp_path / "out"
     result = train([split_dataset, second], out, settings, PlainProgress(io.StringIO()))
     (entry,) = onnx.load(result.file).metadata_props

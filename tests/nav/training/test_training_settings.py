@@ -14,6 +14,10 @@ from nav.training.training_settings import build_settings, parse_size
         ({"size_px": (0, 640)}, "size_px: must be multiples of 32 px"),
         ({"size_px": (4128, 640)}, "size_px: must be at most 4096 px a side, got 4128x640"),
         ({"final_size_px": (480, 320_000)}, "final_size_px: must be at most 4096 px a side"),
+        (
+            {"size_px": (640, 640), "final_size_px": (480, 640)},
+            "final_size_px: must have the shape of the larger size_px 640x640, got 480x640",
+        ),
         ({"batch_images": 5}, "batch_images: must be even"),
         ({"batch_images": 2048}, "batch_images:"),
         ({"loader_workers": 65}, "loader_workers:"),

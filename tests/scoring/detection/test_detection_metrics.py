@@ -161,6 +161,13 @@ def test_boxes_on_an_ignored_drogue_count_neither_way_and_others_beside_it_do() 
     assert [box.score for box in matches.box] == [0.8]
 
 
+def test_a_drogue_before_an_ignored_one_is_found_by_its_own_box() -> None:
+    small = (110.0, 110.0, 12.0, 12.0)
+    scene = replace(image(0, box=small), ignored_others_xywh=(BOX,))
+    matches = Evaluation([scene], [found(scene, 0.9, small), found(scene, 0.7)]).matches([scene])
+    assert matches.is_true[AT_50].tolist() == [True]
+
+
 def test_best_f1_is_the_best_of_all_thresholds(rng: np.random.Generator) -> None:
     images, boxes = random_corpus(rng)
     matches = Evaluation(images, boxes).matches(images)
