@@ -160,10 +160,9 @@ def _weights(features: Sequence[Feature]) -> Array:
 
 
 def _image_radii(truth: DrogueTruth) -> Array:
-    """(2, M) greatest radius of each feature's image, to first order. [px]"""
+    """(2, M) radius of each feature's image if it faces the camera, to first order. [px]"""
     radii_m = np.append(np.full(truth.layout.count, truth.layout.radius_m), truth.layout.hub_outer_radius_m)
-    focal_px = max(truth.rig.camera.fx_px, truth.rig.camera.fy_px)
-    radii: Array = np.broadcast_to(focal_px * radii_m / truth.distance_m, (2, len(radii_m)))
+    radii: Array = np.broadcast_to(truth.rig.delivered_focal_px * radii_m / truth.distance_m, (2, len(radii_m)))
     return radii
 
 

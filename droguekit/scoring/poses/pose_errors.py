@@ -313,10 +313,10 @@ def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: flo
     both = np.bincount(centroids.eye[used], minlength=2)
     if layout.ring_radius_m is None or centroids.is_hub[used].any() or both.min() < 3:
         return None
-    camera = truth.rig.camera
-    focal_px = float(np.sqrt(camera.fx_px * camera.fy_px))
     distance_m = float(np.linalg.norm(_sight_m(truth)))
-    ring = FacingRing(focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), distance_m)
+    ring = FacingRing(
+        truth.rig.delivered_focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), distance_m
+    )
     return sigma_px * ring.tilt_rad
 
 
