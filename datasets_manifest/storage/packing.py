@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import tarfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -152,13 +152,31 @@ def pack_all(dataset: Location) -> None:
     store = FrameStore(dataset)
     if store.pairs_per_tar is None:
         return
-    by_number: dict[int, list[int]] = {}
-    for frame_index in sorted(store.staged):
-        by_number.setdefault(frame_index // store.pairs_per_tar, []).append(frame_index)
     present = set(shard_numbers(store.storage))
-    for number, staged in by_number.items():
+    for number, staged in _by_tar_file(store.staged, store.pairs_per_tar).items():
         packed = read_shard_index(store.storage, number).frames if number in present else {}
         _pack_again(store.storage, number, staged, packed)
+
+
+def remove_packed(dataset: Location, frame_indices: Collection[int]) -> None:
+    """Write tar files anew without some of their frames; only while no other process writes into the dataset.
+
+    Raises:
+        ValueError: the index of a tar file is missing or damaged; names it.
+        OSError: it cannot be read or written.
+    """
+    storage = open_storage(dataset)
+    pairs_per_tar = read_pairs_per_tar(storage)
+    if pairs_per_tar is None:
+        return
+    for number, removed in _by_tar_file(frame_indices, pairs_per_tar).items():
+        packed = read_shard_index(storage, number).frames
+        left = sorted({*packed} - {*removed})
+        if left:
+            _pack(storage, number, _all_packed(storage, number, {index: packed[index] for index in left}))
+        else:
+            storage.delete(shard_index_file(number))
+            storage.delete(shard_file(number))
 
 
 def repair_shards(dataset: Location) -> None:
@@ -188,6 +206,14 @@ def repair_shards(dataset: Location) -> None:
 
 def _indices(names: list[str]) -> set[int]:
     return {index for index in map(frame_of_name, names) if index is not None}
+
+
+def _by_tar_file(frame_indices: Iterable[int], pairs_per_tar: int) -> dict[int, list[int]]:
+    """Frames by the number of their tar file, ascending."""
+    found: dict[int, list[int]] = {}
+    for frame_index in sorted(frame_indices):
+        found.setdefault(frame_index // pairs_per_tar, []).append(frame_index)
+    return found
 
 
 def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mapping[int, Packed]) -> None:
@@ -237,6 +263,12 @@ def _all_staged(storage: Storage, indices: Sequence[int]) -> Iterator[tuple[int,
         if files is None:
             raise _IncompleteFrameError
         yield index, files
+
+
+def _all_packed(storage: Storage, number: int, packed: Mapping[int, Packed]) -> Iterator[tuple[int, Contents]]:
+    """The undamaged frames of a tar file, with their files; only a few are in memory at a time."""
+    contents = map_in_order(lambda index: _packed_files(storage, number, packed[index]), packed, storage)
+    return ((index, files) for index, files in zip(packed, contents, strict=True) if files is not None)
 
 
 def _staged_files(storage: Storage, frame_index: int) -> Contents | None:

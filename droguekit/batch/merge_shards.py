@@ -13,7 +13,7 @@ from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.render_dataset import EventLog, RunSummary, RunTotals, describe_dataset, still_missing
-from droguekit.batch.resume import check_frames, differing_keys, open_dataset
+from droguekit.batch.resume import check_frames, differing_keys, open_dataset, remove_damaged
 from render.version import RENDER_VERSION
 
 _SHOWN = 20
@@ -49,7 +49,9 @@ def merge_shards(
     source = RecipeSource(manifest.recipe, open_storage(first).read(RECIPE_FILE).decode())
     with open_dataset(out, source, pairs_per_tar) as stream:
         events = EventLog(stream)
-        whole = check_frames(out, read_manifest(out)).whole
+        before = read_manifest(out)
+        there = check_frames(out, before)
+        whole = there.whole
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
         totals, packing = RunTotals(), read_packing(out, range(manifest.recipe.frames.count))
         report.begin("pairs", len(sources) - len(whole))
@@ -62,6 +64,7 @@ def merge_shards(
                 report.advance()
         finally:
             report.end()
+        remove_damaged(out, before, {*there.damaged} - {*sources})
         missing = still_missing(drops, out)
         result = describe_dataset(manifest.recipe, out, missing, made_by=manifest)
         events.write("end", pairs=result.counts.pairs, dataset_sha256=result.dataset_sha256)

@@ -24,7 +24,7 @@ from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, availabl
 from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, FrameTask, error_reason
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
-from droguekit.batch.resume import check_frames, finish_frames, open_dataset
+from droguekit.batch.resume import check_frames, finish_frames, open_dataset, remove_damaged
 from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.batch.worker_pool import (
@@ -75,16 +75,16 @@ class RunTotals:
         return {"made": len(self.made), **numbers, "stage_s": dict(self.stage_s)}
 
 
-class RunSize(NamedTuple):
-    """How much a run has to do, and who does it.
+class RunConditions(NamedTuple):
+    """What decides whether an error ends a run.
 
     Attributes:
-        planned: frames to make.
-        workers: processes that make them.
+        is_first: whether the dataset has no frames yet.
+        workers: processes that make the frames.
         crash_advice: what to do where native code ends workers.
     """
 
-    planned: int
+    is_first: bool
     workers: int
     crash_advice: str
 
@@ -122,7 +122,7 @@ def make_frames(
     totals, drops = RunTotals(), list[Drop]()
     if not todo:
         return totals, drops
-    run = RunSize(len(todo), options.worker_count(), crash_advice(task.recipe.render.engine))
+    run = RunConditions(task.engine_version is None, options.worker_count(), crash_advice(task.recipe.render.engine))
     report.begin("pairs", len(todo))
     try:
         with StopRequest(report.say) as stop, closing(_attempts(task, todo, options, stop)) as attempts:
@@ -141,7 +141,7 @@ def _record_attempt(
     attempt: TaskAttempt[FrameReport],
     totals: RunTotals,
     drops: list[Drop],
-    run: RunSize,
+    run: RunConditions,
     report: ProgressReport,
     events: EventLog,
 ) -> None:
@@ -203,7 +203,7 @@ def unit_of_frame(recipe: Recipe, frame_index: int) -> int:
     return scene_of_frame(recipe, frame_index)
 
 
-def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, dropped: int, run: RunSize) -> str:
+def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, dropped: int, run: RunConditions) -> str:
     """Why an attempt failed.
 
     Raises:
@@ -220,9 +220,13 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, droppe
             raise OSError(f"no frame can be made: {accidents} attempts failed, the last: {error}{advice}") from error
         return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}{advice}"
     if not isinstance(error, LostWorkersError):
-        is_common = not totals.made and dropped + 1 >= min(FIRST_FRAMES, run.planned)
-        if is_common or isinstance(error, FATAL_ERRORS):
+        if isinstance(error, FATAL_ERRORS):
             raise error
+        if run.is_first and not totals.made and dropped + 1 >= FIRST_FRAMES:
+            if not isinstance(error, ValueError):
+                raise error
+            reason = f"{error_reason(error)}; the first {FIRST_FRAMES} pairs all fail"
+            raise ValueError(f"frame {attempt.index}: {reason}") from error
     return error_reason(error)
 
 
@@ -295,6 +299,10 @@ def render_dataset(
         task = FrameTask(recipe, out, there.engine_version, packing, options.device)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
         totals, dropped = make_frames(task, todo, options, report, events)
+        lost = sorted({*there.damaged} - {*totals.made})
+        if lost:
+            report.say(f"{len(lost)} damaged pairs could not be made again and are removed: {_shortened(lost)}")
+            remove_damaged(out, manifest, lost)
         # Somebody else may have deleted frames, or the whole folder, meanwhile.
         if not open_storage(out).exists(RECIPE_FILE):
             open_storage(out).write(RECIPE_FILE, source.text.encode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,15 @@ from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore, shard_numbers
 from datasets_manifest.storage.manifest import Manifest, build_manifest, read_manifest, write_manifest
-from datasets_manifest.storage.packing import check_pairs_per_tar, configure_packing, pack_all, repair_shards
+from datasets_manifest.storage.packing import (
+    check_pairs_per_tar,
+    configure_packing,
+    pack_all,
+    remove_packed,
+    repair_shards,
+)
 from datasets_manifest.storage.storage import Location, map_in_order, open_storage
-from datasets_manifest.storage.writer import remove_leftovers
+from datasets_manifest.storage.writer import remove_frame, remove_leftovers
 from datasets_manifest.types.records import PairRecord
 from drogue_models.untrusted_files import parse_json
 from render.version import RENDER_VERSION
@@ -186,7 +192,7 @@ def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
         ValueError: frames were made by different engine versions, or the index of a tar file is damaged.
         OSError: the connection to an object store fails, which is no damage of the frames.
     """
-    record_hashes = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
+    record_hashes = _record_hashes(manifest)
     whole: list[int] = []
     damaged: list[int] = []
     versions: dict[str, int] = {}
@@ -203,6 +209,29 @@ def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
         shown = ", ".join(f"frame {index} by {version}" for version, index in versions.items())
         raise ValueError(f"{dataset}: its frames were made by different engines: {shown}; delete those of one")
     return ExistingFrames(frozenset(whole), tuple(damaged), next(iter(versions), None))
+
+
+def remove_damaged(dataset: Location, manifest: Manifest, frame_indices: Collection[int]) -> None:
+    """Remove damaged frames that were not made again; where a tar file has an older whole copy, that counts again.
+
+    Args:
+        dataset: its place; no frames may be in the making there.
+        manifest: from before the frames were damaged.
+        frame_indices: of these frames.
+
+    Raises:
+        ValueError: the index of a tar file is damaged.
+        OSError: something cannot be removed, or the connection to an object store fails.
+    """
+    for frame_index in frame_indices:
+        remove_frame(dataset, frame_index)
+    store, record_hashes = FrameStore(dataset), _record_hashes(manifest)
+    packed = set(store.indices()).intersection(frame_indices)
+    remove_packed(dataset, [index for index in packed if _read_whole(store, index, record_hashes.get(index)) is None])
+
+
+def _record_hashes(manifest: Manifest) -> dict[int, str]:
+    return {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
 
 
 def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) -> PairRecord | None:

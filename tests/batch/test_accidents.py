@@ -20,12 +20,15 @@ import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage import layout
+from datasets_manifest.storage.frame_store import list_frames, read_shard_index
 from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.render_dataset import unit_of_frame
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.cli.main import INTERRUPTED
+from labelgen.validation.dataset_checks import validate_dataset
 from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, file_hashes, render_recipe
 
 Troubled = Callable[..., Path]
@@ -255,3 +258,90 @@ def test_a_jump_of_the_clock_changes_nothing(troubled: Troubled, quick_dataset: 
         capture_output=True,
     )
     assert file_hashes(tmp_path / "out") == file_hashes(quick_dataset)
+
+
+def damage(dataset: Path, index: int, name: str = "left.png") -> None:
+    """Truncate a file of a frame, in its folder or in the tar file of all frames."""
+    path = layout.frame_folder(dataset, index) / name
+    if path.exists():
+        path.write_bytes(path.read_bytes()[:100])
+        return
+    file = read_shard_index(open_storage(dataset), 0).frames[index][name]
+    with (dataset / layout.shard_file(0)).open("r+b") as archive:
+        archive.seek(file.offset)
+        archive.write(b"\0" * file.size)
+
+
+@pytest.mark.parametrize("name", ["left.png", layout.RECORD_FILE])
+@pytest.mark.parametrize("pairs_per_tar", [None, 100])
+def test_damaged_frames_that_cannot_be_made_again_are_left_out(
+    pairs_per_tar: int | None, name: str, troubled: Troubled, quick_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(quick_dataset, out)
+    if pairs_per_tar is not None:
+        render_recipe(out, workers=ExecutionOptions(0, pairs_per_tar=pairs_per_tar), text=QUICK_RECIPE)
+    for index in (2, 5):
+        damage(out, index, name)
+    told = io.StringIO()
+    troubled(refuse=[2])
+    summary = render_recipe(out, workers=0, text=QUICK_RECIPE, told=told)
+    assert [(drop.frame_index, drop.reason) for drop in summary.drops] == [(2, "frame 2 is beyond me")]
+    assert (summary.pairs, summary.totals.made) == (7, [5])
+    assert "1 damaged pairs could not be made again and are removed: 2" in told.getvalue()
+    assert read_manifest(out).drops == summary.drops
+    assert list_frames(out) == [0, 1, 3, 4, 5, 6, 7]
+    assert validate_dataset(out).passed
+    troubled()
+    whole = render_recipe(out, workers=0, text=QUICK_RECIPE)
+    assert (whole.drops, whole.totals.made) == ((), [2])
+    assert whole.dataset_sha256 == read_manifest(quick_dataset).dataset_sha256
+
+
+def test_a_tar_file_whose_last_frame_is_removed_goes_with_it(
+    troubled: Troubled, quick_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    render_recipe(out, [0], ExecutionOptions(0, pairs_per_tar=100), QUICK_RECIPE)
+    damage(out, 0)
+    troubled(refuse=[0])
+    assert render_recipe(out, [0, 1], 0, QUICK_RECIPE).pairs == 1
+    assert list_frames(out) == [1]
+    damage(out, 1)
+    troubled(refuse=[1])
+    assert [drop.frame_index for drop in render_recipe(out, [1], 0, QUICK_RECIPE).drops] == [0, 1]
+    assert sorted(path.name for path in (out / layout.SHARDS_FOLDER).iterdir()) == ["layout.json"]
+
+
+def test_a_whole_copy_in_a_tar_file_outlives_a_damaged_folder(
+    troubled: Troubled, quick_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(quick_dataset, out)
+    render_recipe(out, workers=ExecutionOptions(0, pairs_per_tar=100), text=QUICK_RECIPE)
+    shutil.copytree(layout.frame_folder(quick_dataset, 4), layout.frame_folder(out, 4))
+    damage(out, 4)
+    troubled(refuse=[4])
+    summary = render_recipe(out, workers=0, text=QUICK_RECIPE)
+    assert (summary.drops, summary.dataset_sha256) == ((), read_manifest(quick_dataset).dataset_sha256)
+    assert not layout.frame_folder(out, 4).exists()
+    assert validate_dataset(out).passed
+
+
+def test_a_frame_that_cannot_be_made_is_left_out_of_every_later_run(
+    troubled: Troubled, quick_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(quick_dataset, out)
+    for index in (1, 3, 6):
+        shutil.rmtree(layout.frame_folder(out, index))
+    troubled(refuse=[1, 3, 6])
+    for chosen in ([1], [1, 3], range(8)):
+        summary = render_recipe(out, chosen, 0, QUICK_RECIPE)
+        assert [drop.frame_index for drop in summary.drops] == [index for index in (1, 3, 6) if index in chosen]
+
+
+def test_a_single_frame_that_cannot_be_made_is_left_out(troubled: Troubled, tmp_path: Path) -> None:
+    troubled(refuse=[1])
+    summary = render_recipe(tmp_path / "out", [1], 0, QUICK_RECIPE)
+    assert [drop.frame_index for drop in summary.drops] == [1]

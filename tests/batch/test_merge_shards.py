@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
-from droguekit.cli.main import DONE, WRONG_INPUT, run
+from datasets_manifest.storage.manifest import Drop, build_manifest, read_manifest, with_build, write_manifest
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
+from render.version import RENDER_VERSION
+from scenes.sampler import split_of_scenes
 from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes, render_recipe
 
 
@@ -67,6 +69,24 @@ def test_a_merge_goes_on_where_it_stopped(
     assert merge(out, *made_shards) == DONE
     assert "joined 2 pairs" in capsys.readouterr().out
     assert file_hashes(out) == file_hashes(whole)
+
+
+def test_a_damaged_frame_that_all_shards_left_out_is_left_out(
+    shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert merge(out, *shards) == DONE
+    manifest = read_manifest(shards[1])
+    shutil.rmtree(layout.frame_folder(shards[1], 4))
+    drops = [Drop(frame_index=4, reason="it was too hard")]
+    splits = split_of_scenes(manifest.recipe)
+    write_manifest(shards[1], build_manifest(shards[1], manifest.recipe, RENDER_VERSION, splits, drops))
+    image = layout.frame_folder(out, 4) / "left.png"
+    image.write_bytes(image.read_bytes()[:-1])
+    assert merge(out, *shards) == FAULT
+    assert "frame 4 is missing: it was too hard" in capsys.readouterr().err
+    assert layout.frame_indices(out) == [0, 1, 2, 3, 5, 6, 7]
+    assert validate_dataset(out).passed
 
 
 def test_missing_frames_are_named(

@@ -95,6 +95,14 @@ def test_deaths_after_a_frame_is_made_cost_their_frames_only(tmp_path: Path, mon
     assert drops[0].reason == "its worker process died (SIGILL), attempt 3 of 3"
 
 
+def test_an_error_that_the_first_frames_share_names_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    attempts = [TaskAttempt[FrameReport](index, 1, None, ValueError("no sky"), final=True) for index in range(4, 8)]
+    monkeypatch.setattr(rendering, "run_tasks", lambda *_: (attempt for attempt in attempts))
+    task, told = FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path), io.StringIO()
+    with pytest.raises(ValueError, match=r"^frame 6: no sky; the first 3 pairs all fail$"):
+        make_frames(task, range(4, 8), ExecutionOptions(2), PlainProgress(told), EventLog(io.StringIO()))
+
+
 def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(tiny_dataset, out)
