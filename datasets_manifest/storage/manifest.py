@@ -41,6 +41,8 @@ CONVENTIONS = {
     "time": "of the middle of the exposure",
 }
 
+# Between the versions of a package that two builds used.
+_AND = " and "
 _CPU_INFO = Path("/proc/cpuinfo")
 _SOFTWARE = ("droguekit", "numpy", "scipy", "opencv-python-headless", "pydantic", "trimesh", "mitsuba", "drjit", "bpy")
 
@@ -138,7 +140,7 @@ class Manifest(FrozenModel):
     Attributes:
         recipe: with every reference replaced by its contents.
         conventions: axes, units, pixels, quaternions.
-        software, cpu_features: of the machine that wrote this file.
+        software, cpu_features: that made the frames; those of several builds are joined.
         engines: pairs by engine and version.
         render_version: changes whenever the same recipe gives different pixels.
         drops: frames of the recipe that were not made.
@@ -233,6 +235,16 @@ def with_build(manifest: Manifest, software: Mapping[str, str], cpu_features: Se
     content = manifest.model_dump(mode="json", exclude={"manifest_sha256"})
     content.update(software=dict(software), cpu_features=list(cpu_features))
     return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
+
+
+def with_another_build(manifest: Manifest, software: Mapping[str, str], cpu_features: Sequence[str]) -> Manifest:
+    """The manifest of a dataset of two builds: both versions of a package, and the processor features of both."""
+    versions = {
+        name: {*manifest.software.get(name, "missing").split(_AND), software.get(name, "missing")}
+        for name in sorted({*manifest.software, *software})
+    }
+    joined = {name: _AND.join(sorted(found)) for name, found in versions.items()}
+    return with_build(manifest, joined, list(dict.fromkeys([*manifest.cpu_features, *cpu_features])))
 
 
 def write_manifest(dataset: Location, manifest: Manifest) -> None:

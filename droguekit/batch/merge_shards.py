@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import hashlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from datasets_manifest.recipe.recipe import RecipeSource
-from datasets_manifest.storage.layout import RECIPE_FILE
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import RECIPE_FILE, RECORD_FILE
 from datasets_manifest.storage.manifest import Manifest, read_manifest
 from datasets_manifest.storage.packing import pack_if_complete, read_packing
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.storage import Location, map_in_order, open_storage
 from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.render_dataset import EventLog, RunSummary, RunTotals, describe_dataset, still_missing
@@ -17,6 +19,7 @@ from droguekit.batch.resume import check_frames, differing_keys, open_dataset, r
 from render.version import RENDER_VERSION
 
 _SHOWN = 20
+_SAME_BUILD = "make all shards with the same packages on processors of one kind"
 
 
 def merge_shards(
@@ -33,7 +36,8 @@ def merge_shards(
         pairs_per_tar: frames in a tar file; None keeps what the dataset has, folders at first.
 
     Raises:
-        ValueError: the shards do not belong together, lack frames, or hold damaged ones; nothing is joined then.
+        ValueError: the shards do not belong together or to the frames in `out`, lack frames, or hold damaged ones;
+            nothing is joined then.
         OSError: the folder cannot be written; finished frames stay.
     """
     if not shards:
@@ -50,14 +54,17 @@ def merge_shards(
     with open_dataset(out, source, pairs_per_tar) as stream:
         events = EventLog(stream)
         before = read_manifest(out)
+        if before.frames:
+            _check_compatible(first, manifest, out, before, "merge into a new folder")
         there = check_frames(out, before)
         whole = there.whole
+        _check_kept(out, whole, sources)
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
         totals, packing = RunTotals(), read_packing(out, range(manifest.recipe.frames.count))
         report.begin("pairs", len(sources) - len(whole))
         try:
             for frame_index in sorted(set(sources) - whole):
-                totals.size_bytes += _copy_frame(datasets[sources[frame_index]], frame_index, out)
+                totals.size_bytes += _copy_frame(datasets[sources[frame_index][0]], frame_index, out)
                 totals.made.append(frame_index)
                 if packing is not None:
                     pack_if_complete(out, frame_index, packing)
@@ -72,7 +79,9 @@ def merge_shards(
     return RunSummary(totals, len(whole), missing, result.counts.pairs, planned, result.dataset_sha256)
 
 
-def _check_compatible(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
+def _check_compatible(
+    first: Location, manifest: Manifest, shard: Location, other: Manifest, advice: str = _SAME_BUILD
+) -> None:
     """Check that two shards are parts of one dataset.
 
     Raises:
@@ -85,7 +94,7 @@ def _check_compatible(first: Location, manifest: Manifest, shard: Location, othe
         if there != here:
             raise ValueError(
                 f"{shard}: was made with {what} {here}, but {first} with {there}; their pixels or last digits differ: "
-                "make all shards with the same packages on processors of one kind"
+                f"{advice}"
             )
     if other.render_version != RENDER_VERSION:
         raise ValueError(f"{shard}: is of render version {other.render_version}, this is {RENDER_VERSION}; use that")
@@ -106,8 +115,8 @@ def _build_pairs(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str
     )
 
 
-def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, Location]:
-    """The shard that holds each frame.
+def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, tuple[Location, str]]:
+    """The shard that holds each frame, and the hash of its record.
 
     Raises:
         ValueError: two shards hold different frames of one index.
@@ -120,7 +129,21 @@ def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, Location]:
                 raise ValueError(
                     f"{shard}: its frame {entry.frame_index} differs from that of {known}; make both again"
                 )
-    return {frame_index: shard for frame_index, (shard, _) in found.items()}
+    return found
+
+
+def _check_kept(out: Location, whole: Collection[int], sources: Mapping[int, tuple[Location, str]]) -> None:
+    """Check that the frames which stay in the dataset are those of the shards.
+
+    Raises:
+        ValueError: one differs; names it.
+    """
+    store, kept = FrameStore(out), sorted(sources.keys() & whole)
+    records = map_in_order(lambda frame_index: store.read(frame_index, RECORD_FILE), kept, store.storage)
+    for frame_index, record in zip(kept, records, strict=True):
+        shard, sha256 = sources[frame_index]
+        if hashlib.sha256(record).hexdigest() != sha256:
+            raise ValueError(f"{out}: its frame {frame_index} differs from that of {shard}; merge into a new folder")
 
 
 def _check_complete(count: int, there: set[int]) -> None:

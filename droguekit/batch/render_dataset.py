@@ -24,7 +24,7 @@ from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, availabl
 from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, FrameTask, error_reason
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
-from droguekit.batch.resume import check_frames, finish_frames, open_dataset, remove_damaged
+from droguekit.batch.resume import check_frames, finish_frames, join_build, open_dataset, remove_damaged
 from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.task_queue import TaskQueue
 from droguekit.batch.worker_pool import (
@@ -42,6 +42,7 @@ from scenes.sampler import scene_of_frame, split_of_scenes
 
 # With so many pairs, a step of milliseconds a pair takes long enough to be announced.
 _MANY_PAIRS = 1000
+_OTHER_BUILD = "another build made the existing pairs, so new ones may differ in pixels or last digits"
 _VANISHED = "it was there, and somebody deleted it during the run; run the same command to make it again"
 
 
@@ -298,6 +299,11 @@ def render_dataset(
         packing = read_packing(out, frames if isinstance(frames, range) else range(recipe.frames.count))
         task = FrameTask(recipe, out, there.engine_version, packing, options.device)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
+        made_by = manifest if there.whole else None
+        if there.whole and todo:
+            made_by, differences = join_build(out, manifest)
+            if differences:
+                report.say(f"{_OTHER_BUILD}: {'; '.join(differences)}")
         totals, dropped = make_frames(task, todo, options, report, events)
         lost = sorted({*there.damaged} - {*totals.made})
         if lost:
@@ -311,7 +317,7 @@ def render_dataset(
         drops = still_missing([*manifest.drops, *dropped], out)
         if kept + len(totals.made) >= _MANY_PAIRS:
             report.say(f"writing manifest and annotations of {kept + len(totals.made)} pairs")
-        manifest = describe_dataset(recipe, out, drops)
+        manifest = describe_dataset(recipe, out, drops, made_by)
         cost = {**totals.as_event(), "drops": len(drops)}
         events.write("end", pairs=manifest.counts.pairs, dataset_sha256=manifest.dataset_sha256, **cost)
     return RunSummary(totals, kept, drops, manifest.counts.pairs, recipe.frames.count, manifest.dataset_sha256)

@@ -14,7 +14,16 @@ from datasets_manifest.atomic import try_lock
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore, shard_numbers
-from datasets_manifest.storage.manifest import Manifest, build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.manifest import (
+    Manifest,
+    build_manifest,
+    cpu_features,
+    differing_builds,
+    read_manifest,
+    software_versions,
+    with_another_build,
+    write_manifest,
+)
 from datasets_manifest.storage.packing import (
     check_pairs_per_tar,
     configure_packing,
@@ -209,6 +218,26 @@ def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
         shown = ", ".join(f"frame {index} by {version}" for version, index in versions.items())
         raise ValueError(f"{dataset}: its frames were made by different engines: {shown}; delete those of one")
     return ExistingFrames(frozenset(whole), tuple(damaged), next(iter(versions), None))
+
+
+def join_build(dataset: Location, manifest: Manifest) -> tuple[Manifest, list[str]]:
+    """Note this build in the manifest of a dataset whose frames another one made.
+
+    The manifest is written before the first frame, so that also a run that is killed leaves it.
+
+    Returns:
+        The manifest, and the differences from this build, a line each; none for the same build.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    software, features = software_versions(), cpu_features()
+    differences = differing_builds(manifest.software, manifest.cpu_features, software, features)
+    if not differences:
+        return manifest, differences
+    joined = with_another_build(manifest, software, features)
+    write_manifest(dataset, joined)
+    return joined, differences
 
 
 def remove_damaged(dataset: Location, manifest: Manifest, frame_indices: Collection[int]) -> None:

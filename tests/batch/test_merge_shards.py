@@ -153,6 +153,37 @@ def test_two_frames_of_one_index_are_refused(
     assert "its frame 0 differs from that of" in capsys.readouterr().err
 
 
+def test_frames_of_another_build_in_the_dataset_are_refused(
+    shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert merge(out, *shards) == DONE
+    manifest = read_manifest(out)
+    write_manifest(out, with_build(manifest, {**manifest.software, "numpy": "0.9"}, manifest.cpu_features))
+    before = file_hashes(out)
+    assert merge(out, *shards) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert "out: was made with numpy 0.9, but" in told and "differ: merge into a new folder" in told
+    assert file_hashes(out) == before
+
+
+@pytest.mark.parametrize("is_listed", [True, False])
+def test_a_kept_frame_that_differs_from_its_shard_is_refused(
+    is_listed: bool, shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert merge(out, *shards) == DONE
+    record_file = layout.frame_folder(out, 3) / layout.RECORD_FILE
+    record_file.write_text(record_file.read_text().replace('"family":"clear"', '"family":"foggy"'))
+    manifest = read_manifest(out)
+    listed = out if is_listed else tmp_path / "empty"
+    splits = split_of_scenes(manifest.recipe)
+    write_manifest(out, build_manifest(listed, manifest.recipe, RENDER_VERSION, splits))
+    capsys.readouterr()
+    assert merge(out, *shards) == WRONG_INPUT
+    assert f"out: its frame 3 differs from that of {shards[0]}; merge into a new folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("shard", "message"), [("3/3", "i from 0 to n - 1"), ("1", "i/n"), ("8/9", "none of the 8")])
 def test_wrong_shards(
     shard: str, message: str, recipe_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

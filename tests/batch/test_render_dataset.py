@@ -16,11 +16,11 @@ import pytest
 
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch import render_dataset as rendering
 from droguekit.batch.execution import ExecutionOptions
-from droguekit.batch.frame_task import FrameReport, FrameTask
+from droguekit.batch.frame_task import FrameReport, FrameTask, reproduce_frame
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import EventLog, make_frames, render_dataset
 from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerDiedError, run_in_own_process
@@ -190,6 +190,38 @@ def test_events_tell_of_every_frame_and_are_only_added_to(analytic_dataset: Path
     new = [json.loads(line) for line in text[len(before) :].splitlines()]
     assert [(line["event"], line.get("frame")) for line in new] == [("start", None), ("frame", 3), ("end", None)]
     assert all(seconds >= 0 for seconds in new[1]["stage_s"].values())
+
+
+def test_another_build_of_the_existing_pairs_is_told_and_recorded(analytic_dataset: Path, tmp_path: Path) -> None:
+    out, told = tmp_path / "copy", io.StringIO()
+    shutil.copytree(analytic_dataset, out)
+    own = read_manifest(out)
+    write_manifest(out, with_build(own, {**own.software, "numpy": "0.9"}, own.cpu_features))
+    # A run that makes nothing changes nothing.
+    before = file_hashes(out)
+    render_recipe(out, [1], 0, ANALYTIC_RECIPE, told)
+    assert "another build" not in told.getvalue() and read_manifest(out).software["numpy"] == "0.9"
+    assert file_hashes(out).keys() == before.keys()
+    for index in (1, 2):
+        shutil.rmtree(layout.frame_folder(out, index))
+        told = io.StringIO()
+        render_recipe(out, [index], 0, ANALYTIC_RECIPE, told)
+        assert "another build made the existing pairs, so new ones may differ in pixels or last digits: numpy" in (
+            told.getvalue()
+        )
+        found = read_manifest(out)
+        assert found.software == {**own.software, "numpy": f"0.9 and {own.software['numpy']}"}
+        assert found.cpu_features == own.cpu_features
+    assert reproduce_frame(out, 1).verdict == "identical"
+
+
+def test_the_same_build_goes_on_without_a_word(analytic_dataset: Path, tmp_path: Path) -> None:
+    out, told = tmp_path / "copy", io.StringIO()
+    shutil.copytree(analytic_dataset, out)
+    shutil.rmtree(layout.frame_folder(out, 1))
+    render_recipe(out, workers=0, text=ANALYTIC_RECIPE, told=told)
+    assert "another build" not in told.getvalue()
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
 def test_another_recipe_is_refused_with_the_keys_that_differ(tiny_dataset: Path) -> None:
