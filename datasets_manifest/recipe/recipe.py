@@ -50,6 +50,7 @@ def fill_families(table: dict[str, Any]) -> None:
                 family[section] = {**deepcopy(common), **own}
 
 
+NAME_PATTERN = r"^[a-z0-9][a-z0-9-]*$"
 MAX_SEED = 2**63 - 1
 _ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")
 
@@ -146,7 +147,7 @@ class Family(FrozenModel):
             the keys that differ from the recipe's.
     """
 
-    name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(min_length=1, max_length=40, pattern=NAME_PATTERN)
     weight: float = Field(default=1.0, gt=0, le=1e6)
     pose: PoseRanges = PoseRanges()
     target: AppearanceRanges = AppearanceRanges()
@@ -180,7 +181,7 @@ class Recipe(FrozenModel):
         camera: flaws, processing and coding of the pictures, or none for the sensor's own.
     """
 
-    name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(min_length=1, max_length=80, pattern=NAME_PATTERN)
     description: str = Field(default="", max_length=2000)
     family: str = Field(default="clear", min_length=1, max_length=40)
     seed: int = Field(default=1, ge=0, le=MAX_SEED)

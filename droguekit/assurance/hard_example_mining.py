@@ -12,9 +12,12 @@ the mean by a few cases' weight, so that two failures of two cases do not outwei
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ import tomlkit
 
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.file_names import move_file_names
-from datasets_manifest.recipe.recipe import MAX_SEED, Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import MAX_SEED, NAME_PATTERN, Recipe, parse_recipe
 from datasets_manifest.storage.layout import RECIPE_FILE
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, join, open_storage
@@ -39,6 +42,10 @@ from scenes.framing import distance_at
 # A bin's failures count beside so many cases with the mean failure fraction.
 _PRIOR_CASES = 4.0
 _DIGITS = 4
+
+# The bin of a case by family, drogue and distance; failures and cases by bin.
+_Key = Callable[[str, str, float | None], str]
+_Tally = Callable[[_Key], tuple[Counter[str], Counter[str]]]
 
 
 class MinedBin(FrozenModel):
@@ -144,6 +151,10 @@ def mine_recipe(
     Raises:
         ValueError: nothing is scored, nothing failed, or the recipe has no law to change; a file cannot be read.
     """
+    if not re.fullmatch(NAME_PATTERN, out.stem):
+        raise ValueError(
+            f"--out: the file names the recipe, so it takes lower-case letters, digits and hyphens, got {out.name}"
+        )
     source = Dataset(dataset)
     text, old = _recipe_of(source, choices.recipe)
     records: dict[int, tuple[str, str, float | None]] = {}
@@ -156,6 +167,10 @@ def mine_recipe(
     names, solved = solved_cases(source, choices.most_position_error_fraction, note, estimates, detections, report)
     chosen = _chosen(names, choices.scored)
     cases = {index: scores[chosen] for index, scores in solved.items() if chosen in scores}
+    if not cases:
+        raise ValueError(
+            f"{source.path}: no pair has a drogue that {chosen} is to find; there is nothing to learn from"
+        )
     if not any(hits < of for hits, of in cases.values()):
         raise ValueError(f"{source.path}: {chosen} solves every case; there is nothing to learn from")
     table = tomlkit.parse(text)
@@ -243,7 +258,7 @@ def _change_laws(
 ) -> Iterator[MinedLaw]:
     """Weight the laws in a recipe's table, in place, and tell of each."""
 
-    def tally(key_of: Callable[[str, str, float | None], str]) -> tuple[Counter[str], Counter[str]]:
+    def tally(key_of: _Key) -> tuple[Counter[str], Counter[str]]:
         failures: Counter[str] = Counter()
         counts: Counter[str] = Counter()
         for index, (hits, of) in cases.items():
@@ -270,23 +285,35 @@ def _change_laws(
         table["distance"]["edges_m"] = edges_m
         table["distance"]["weights"] = [round(place.after * len(names), _DIGITS) for place in law.bins]
         yield law
-    failures, counts = tally(lambda family, drogue, distance_m: drogue)
-    own = [(f"drogues of {family['name']}", family.get("target", {})) for family in families]
-    parts = dict(zip((name for name, _ in own), (family.target for family in old.families), strict=True))
-    for name, part in (("drogues", table.get("target", {})), *own):
-        if len(part.get("variants", ())) < 2:
+    yield from _change_drogue_laws(table, old, {family for family, _, _ in records.values()}, tally, kept)
+
+
+def _change_drogue_laws(
+    table: Any, old: Recipe, seen_families: AbstractSet[str], tally: _Tally, kept: float
+) -> Iterator[MinedLaw]:
+    """Weight the drogues of the recipe, and of the families that have their own; each by its own cases alone."""
+    families = table.get("families", [])
+    own = {family["name"] for family in families if "variants" in family.get("target", {})}
+    laws = [("drogues", table.get("target", {}), old.target, seen_families - own)]
+    for written, family in zip(families, old.families, strict=True):
+        laws.append((f"drogues of {family.name}", written.get("target", {}), family.target, {family.name} & own))
+    for of, part, target, users in laws:
+        if len(part.get("variants", ())) < 2 or not users:
             continue
-        variants = parts[name].variants if name in parts else old.target.variants
         by_drogue: dict[str, float] = defaultdict(float)
-        for variant in variants:
+        for variant in target.variants:
             by_drogue[variant.drogue.name] += variant.weight
-        law = _mined(name, by_drogue, failures, counts, kept)
+        law = _mined(of, by_drogue, *tally(partial(_drogue_in, users)), kept)
         grown = {place.name: place.after / place.before for place in law.bins}
         total = sum(by_drogue.values())
-        for written, variant in zip(part["variants"], variants, strict=True):
+        for row, variant in zip(part["variants"], target.variants, strict=True):
             share = grown[variant.drogue.name] * variant.weight / total
-            written["weight"] = round(share * len(variants), _DIGITS)
+            row["weight"] = round(share * len(target.variants), _DIGITS)
         yield law
+
+
+def _drogue_in(users: AbstractSet[str], family: str, drogue: str, distance_m: float | None) -> str:
+    return drogue if family in users else ""
 
 
 def _distance_bins(law: DistanceLaw, count: int) -> tuple[list[float], list[float]]:

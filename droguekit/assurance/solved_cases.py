@@ -47,10 +47,16 @@ def solved_cases(
         report: is told of the progress, or None.
 
     Raises:
-        ValueError: a record or file that cannot be read.
+        ValueError: a record or file that cannot be read, or two sources of one name.
     """
     read = None if estimates is None else read_estimates(estimates)
     methods = {} if read is None else estimates_by_method(read, source.frame_indices, str(estimates))
+    names = (*methods, *(path.stem for path in detections))
+    for path in detections:
+        if path.stem in methods:
+            raise ValueError(f"--detections: {path.stem!r} is also a method's name; rename the file")
+        if names.count(path.stem) > 1:
+            raise ValueError(f"--detections: two are named {path.stem!r}; rename a file")
     camera, splits = source.manifest.recipe.rig.camera, source.manifest.split_of_frame()
     solved: SolvedCases = defaultdict(dict)
     images: list[ImageTruth] = []
@@ -72,11 +78,9 @@ def solved_cases(
         shown.end()
     image_ids = frozenset(image_id_of(index, eye) for index in source.frame_indices for eye in EYES)
     for path in detections:
-        if path.stem in methods:
-            raise ValueError(f"--detections: {path.stem!r} is also a method's name; rename the file")
         for index, share in _found_boxes(images, path, image_ids).items():
             solved[index][path.stem] = share
-    return (*methods, *(path.stem for path in detections)), solved
+    return names, solved
 
 
 def _is_near(answer: Estimate | None, record: PairRecord, most_fraction: float) -> bool:

@@ -164,3 +164,15 @@ def test_shipped_domains_say_where_their_numbers_come_from(name: str) -> None:
     domain = load_domain(name)
     assert domain.description
     assert all(quantity.source for quantity in domain.quantities.values() if quantity.edges is not None)
+
+
+def test_two_detection_files_of_one_name_are_refused(
+    dataset: Path, domain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["coverage", str(dataset), "--odd", str(domain)]
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "boxes.json").write_text("[]")
+        command += ["--detections", str(tmp_path / folder / "boxes.json")]
+    assert run(command) == WRONG_INPUT
+    assert "--detections: two are named 'boxes'; rename a file" in capsys.readouterr().err

@@ -108,6 +108,41 @@ def test_shares_are_what_the_objective_says(dataset: Path, tmp_path: Path) -> No
         assert sum(place.failures for place in laws[law].bins) == sum(is_hard(record) for record in records) > 3
 
 
+def test_a_familys_own_drogues_have_their_own_cases(tmp_path: Path) -> None:
+    variants = [{"drogue": "red-8"}, {"drogue": "red-5"}]
+    families = [{"name": "clear"}, {"name": "hazy"}, {"name": "own", "target": {"variants": variants}}]
+    frames = {"count": 40, "scenes": 40, "empty_fraction": 0.0}
+    dataset = rendered(text_of(target={"variants": variants}, families=families, frames=frames), tmp_path / "dataset")
+
+    def fails(record: PairRecord) -> bool:
+        return record.conditions.family == "own" and record.frame.drogue.name == "red-8"
+
+    poses = write_failures(dataset, tmp_path / "poses.jsonl", fails)
+    mined = mine_recipe(dataset, Path("harder.toml"), MiningChoices(), poses)
+    drawn = Counter(
+        (record.conditions.family == "own", record.frame.drogue.name) for record in Dataset(dataset).records()
+    )
+    laws = {law.of: {place.name: place for place in law.bins} for law in mined.laws}
+    assert set(laws) == {"families", "distance", "drogues", "drogues of own"}
+    for of, is_own in (("drogues", False), ("drogues of own", True)):
+        assert {name: place.cases for name, place in laws[of].items()} == {
+            name: drawn[is_own, name] for name in ("red-8", "red-5")
+        }
+    assert laws["drogues of own"]["red-8"].failures == drawn[True, "red-8"] > 0
+    assert [place.after for place in laws["drogues"].values()] == [0.5, 0.5]
+    assert laws["drogues of own"]["red-8"].after > 0.55
+
+
+def test_drogues_that_no_family_takes_keep_their_law(tmp_path: Path) -> None:
+    variants = [{"drogue": "red-8"}, {"drogue": "red-5"}]
+    families = [{"name": name, "target": {"variants": variants}} for name in ("clear", "hazy")]
+    frames = {"count": 8, "scenes": 8, "empty_fraction": 0.0}
+    dataset = rendered(text_of(target={"variants": variants}, families=families, frames=frames), tmp_path / "dataset")
+    poses = write_failures(dataset, tmp_path / "poses.jsonl", lambda record: record.frame_index < 4)
+    mined = mine_recipe(dataset, Path("harder.toml"), MiningChoices(), poses)
+    assert [law.of for law in mined.laws] == ["families", "distance", "drogues of clear", "drogues of hazy"]
+
+
 def test_the_new_recipe_draws_what_it_says(dataset: Path, tmp_path: Path) -> None:
     mined = mined_of(dataset, tmp_path, kept=0.3, distance_bins=4, count=4000)
     recipe = parse_recipe(mined.text)
@@ -188,6 +223,14 @@ def test_a_dataset_of_another_engine_can_be_mined(tmp_path: Path, capsys: pytest
     capsys.readouterr()
 
 
+def test_a_dataset_without_a_case_says_so(tmp_path: Path) -> None:
+    frames = {"count": 4, "scenes": 2, "empty_fraction": 1.0}
+    dataset, boxes = rendered(text_of(frames=frames), tmp_path / "dataset"), tmp_path / "boxes.json"
+    boxes.write_text("[]")
+    with pytest.raises(ValueError, match="no pair has a drogue that boxes is to find; there is nothing to learn from"):
+        mine_recipe(dataset, Path("harder.toml"), MiningChoices(), detections=[boxes])
+
+
 def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, out = write_failures(dataset, tmp_path / "poses.jsonl"), tmp_path / "harder.toml"
     plain = ["mine", str(dataset), "--out", str(out)]
@@ -200,6 +243,9 @@ def test_what_cannot_be_mined_says_why(dataset: Path, tmp_path: Path, capsys: py
     ):
         assert run([*plain, *extra]) == WRONG_INPUT
         assert words in capsys.readouterr().err
+    capital = tmp_path / "Harder_2.toml"
+    assert run(["mine", str(dataset), "--out", str(capital)]) == WRONG_INPUT
+    assert "--out: the file names the recipe" in (told := capsys.readouterr().err) and "got Harder_2.toml" in told
     changed = tmp_path / "other.toml"
     changed.write_text(text_of(distance=between(2.0, 30.0)))
     assert run([*plain, "--estimates", str(poses), "--recipe", str(changed)]) == WRONG_INPUT
