@@ -278,14 +278,17 @@ def check_sizes(drawn: DrawnFrames, recipe: Recipe) -> tuple[LawCheck, Array] | 
 def distance_share(law: DistanceLaw, distance_m: Array) -> Array:
     """Share of a law's distances that are nearer than given ones; not for stations."""
     assert law.low_m is not None and law.high_m is not None
-    low, high = law.low_m, law.high_m
+    edges, weights = np.array(law.edges_m or (law.low_m, law.high_m)), np.array(law.weights or (1.0,))
+    ends = np.concatenate([[0.0], np.cumsum(weights) / weights.sum()])
+    place = _cell(distance_m, edges)
+    low, high = edges[place], edges[place + 1]
     if law.law == "uniform":
         share = (distance_m - low) / (high - low)
     elif law.law == "log-uniform":
         share = np.log(distance_m / low) / np.log(high / low)
     else:
         share = (1.0 / low - 1.0 / distance_m) / (1.0 / low - 1.0 / high)
-    result: Array = np.clip(share, 0.0, 1.0)
+    result: Array = ends[place] + np.clip(share, 0.0, 1.0) * (ends[place + 1] - ends[place])
     return result
 
 

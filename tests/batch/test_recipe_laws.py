@@ -11,7 +11,7 @@ from scipy.stats import chisquare, kstest
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from droguekit.batch.recipe_plan import check_places, check_sizes, chi_square, distance_share, draw_frames, plan_recipe
-from scenes.framing import sample_distance_m
+from scenes.framing import distance_at, sample_distance_m
 from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
 
@@ -55,6 +55,38 @@ def test_shares_are_those_of_the_sampler(law: str) -> None:
     drawn = np.array([sample_distance_m(rng, distance, 0) for _ in range(2000)])
     # Under the law the shares below the draws are uniform: Kolmogorov-Smirnov at 1 %.
     assert kstest(distance_share(distance, drawn), "uniform").pvalue > 0.01
+
+
+@pytest.mark.parametrize("law", ["uniform", "log-uniform", "uniform-image-size"])
+@pytest.mark.parametrize("weights", [None, (1.0, 9.0, 0.0, 2.5)])
+def test_shares_are_the_inverse_of_the_sampler(law: str, weights: tuple[float, ...] | None) -> None:
+    edges_m = None if weights is None else (2.0, 3.0, 8.0, 9.0, 40.0)
+    distance = DistanceLaw.model_validate(
+        {"law": law, "low_m": 2.0, "high_m": 40.0, "edges_m": edges_m, "weights": weights}
+    )
+    draws = np.linspace(0.001, 0.999, 500)
+    drawn_m = np.array([distance_at(distance, draw) for draw in draws])
+    expected = draws
+    if law == "uniform-image-size":
+        # Within a bin this law draws the far end first.
+        ends = np.concatenate([[0.0], np.cumsum(weights or (1.0,)) / sum(weights or (1.0,))])
+        place = np.searchsorted(ends, draws, side="right") - 1
+        expected = ends[place] + ends[place + 1] - draws
+    # float64 logarithms and reciprocals
+    np.testing.assert_allclose(distance_share(distance, drawn_m), expected, atol=1e-12)
+    outside = distance_share(distance, np.array([1.0, 2.0, 40.0, 50.0]))
+    np.testing.assert_array_equal(outside, [0.0, 0.0, 1.0, 1.0])
+
+
+def test_weighted_distances_follow_their_law() -> None:
+    weighted = {"law": "log-uniform", "low_m": 4.0, "high_m": 16.0, "edges_m": [4.0, 8.0, 16.0], "weights": [1.0, 9.0]}
+    recipe = lawful(count=400, distance=weighted)
+    sizes = check_sizes(plan_recipe(recipe).drawn, recipe)
+    assert sizes is not None
+    # The first bins are the small, far boxes, which have nine tenths of the pairs.
+    assert sizes[0].expected[:4].sum() > 250
+    # One seed; at 1 in 1000 the test would fail for one of 500 such seeds.
+    assert sizes[0].p_value > 1e-3
 
 
 @pytest.mark.parametrize("law", ["uniform", "log-uniform"])
