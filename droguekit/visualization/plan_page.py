@@ -35,6 +35,7 @@ _LABELS = (
     (np.inf, (1.0,)),
 )
 _SHORT_RANGE = 3.0
+_MOST_STATION_LABELS = 12
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,10 @@ def _distances(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
     axes.set_xlabel("Distance [m]")
     if law.stations_m is not None:
         stations, counts = np.unique(distances.round(9), return_counts=True)
-        axes.bar([f"{station:g}" for station in stations], counts, color=_BAR)
+        places = np.arange(len(stations))
+        axes.bar(places, counts, color=_BAR)
+        labelled = places[:: -(-len(stations) // _MOST_STATION_LABELS)]
+        axes.set_xticks(labelled, [f"{stations[place]:g}" for place in labelled])
         axes.set_ylabel("Stereo pairs at each station")
         return
     edges = _log_edges(distances)

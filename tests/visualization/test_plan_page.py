@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Unpack
 
@@ -12,9 +13,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from droguekit.batch.recipe_plan import plan_recipe
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from droguekit.visualization.plan_page import label_logarithmic
-from tests.support.recipe_builder import RecipeTable, between, recipe_text, stations
+from droguekit.visualization.plan_page import _distances, label_logarithmic
+from tests.support.recipe_builder import RecipeTable, between, build_recipe, recipe_text, stations
 from tests.support.small_datasets import SWINGING
 
 BASE: RecipeTable = {
@@ -60,6 +62,19 @@ def test_stations_have_bars_and_no_law_of_sizes(tmp_path: Path, capsys: pytest.C
     shown = capsys.readouterr().out
     assert "box sizes" not in shown
     assert "places of the box's middle" in shown
+
+
+@pytest.mark.parametrize("count", [1, 12, 13, 40])
+def test_labels_of_many_stations_stay_apart(count: int) -> None:
+    recipe = build_recipe(BASE, distance=stations(*np.linspace(2.25, 120.5, count).round(2)), frames={"count": count})
+    figure = Figure(figsize=(6.2, 4.4), dpi=130, layout="constrained")
+    axes = figure.add_subplot()
+    _distances(axes, recipe, plan_recipe(recipe))
+    figure.draw_without_rendering()
+    assert len(axes.patches) == count
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+    assert axes.get_xticklabels()[0].get_text() == "2.25"
 
 
 def test_the_law_is_printed_with_its_chi_square(capsys: pytest.CaptureFixture[str]) -> None:
