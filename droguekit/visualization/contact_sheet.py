@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -23,6 +23,10 @@ _TEXT_RGB = (255, 255, 255)
 _PAPER = 24
 _GAP_PX = 4
 _CAPTION_PX = 22
+# A sheet takes three bytes a pixel while it is drawn.
+_MOST_PX = 2**28
+# libjpeg's JPEG_MAX_DIMENSION
+_MOST_JPEG_SIDE_PX = 65_500
 
 
 def write_contact_sheet(
@@ -42,17 +46,18 @@ def write_contact_sheet(
         How many pairs it shows, and how many there are.
 
     Raises:
-        ValueError: a number out of its range, another ending, no pairs, or one that cannot be read.
+        ValueError: a number out of its range, another ending, no pairs, one that cannot be read, or a sheet that is
+            too large.
         OSError: it cannot be written.
     """
-    _check_sheet(out, count, columns, tile_width_px)
-    sheet, shown, pairs = _draw_sheet(dataset, count, columns, tile_width_px, by_family)
+    _check_arguments(out, count, columns, tile_width_px)
+    sheet, shown, pairs = _draw_sheet(dataset, out, count, columns, tile_width_px, by_family)
     _, data = cv2.imencode(out.suffix.lower(), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
     write_bytes_atomic(out, data.tobytes())
     return shown, pairs
 
 
-def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
+def _check_arguments(out: Path, count: int, columns: int, tile_width: int) -> None:
     for name, value, low, high in (
         ("count", count, 1, 400),
         ("columns", columns, 1, 40),
@@ -65,7 +70,7 @@ def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
 
 
 def _draw_sheet(
-    dataset: Location, count: int, columns: int, tile_width: int, by_family: bool
+    dataset: Location, out: Path, count: int, columns: int, tile_width: int, by_family: bool
 ) -> tuple[Picture, int, int]:
     """The sheet, the number of pairs that it shows, and of all pairs."""
     is_blind = open_storage(dataset).exists(BLIND_FILE)
@@ -76,61 +81,66 @@ def _draw_sheet(
     if not pairs:
         raise ValueError(f"{dataset}: holds no pairs yet")
     if by_family and isinstance(source, Dataset):
-        sheet, shown = draw_family_sheet(source, count, columns, tile_width)
+        sheet, shown = _family_sheet(source, out, count, columns, tile_width)
         return sheet, shown, pairs
     places = np.linspace(0, pairs - 1, min(count, pairs)).round()
     frames = [source.frame_indices[int(place)] for place in places]
+    tiles = (
+        _draw_blind_tile(source.pair(index), tile_width)
+        if isinstance(source, BlindDataset)
+        else _draw_tile(source.images(index), source.record(index), tile_width)
+        for index in frames
+    )
     columns = min(columns, len(frames))
-    if isinstance(source, BlindDataset):
-        return draw_blind_sheet(source, frames, columns, tile_width), len(frames), pairs
-    return draw_contact_sheet(source, frames, columns, tile_width), len(frames), pairs
+    return _grid(tiles, (math.ceil(len(frames) / columns), columns), out), len(frames), pairs
 
 
-def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:
-    """Tiles of left images with box, marker and hub centres, and a caption with index and distance.
+def _grid(tiles: Iterable[Picture], shape: tuple[int, int], out: Path, down: bool = False) -> Picture:
+    """Equal tiles in rows, or in columns, on a sheet that a file can hold.
 
     Args:
-        dataset: of the pairs.
-        frames: indices, in reading order; at least one.
-        columns: tiles in a row.
-        tile_width_px: width of a tile; its height follows the images.
+        tiles: in reading order; only the first is drawn where the sheet is too large.
+        shape: rows and columns.
+        out: file of the sheet.
+        down: whether they are read from top to bottom first.
 
     Returns:
         (H, W, 3) in the order red, green, blue.
 
     Raises:
-        ValueError: an image or a record cannot be read.
+        ValueError: the sheet is too large for its file.
     """
-    return _grid([_draw_tile(dataset.images(index), dataset.record(index), tile_width_px) for index in frames], columns)
-
-
-def draw_blind_sheet(dataset: BlindDataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:
-    """Tiles of left images without labels, and a caption with index and time; arguments as `draw_contact_sheet`.
-
-    Raises:
-        ValueError: an image cannot be read.
-    """
-    return _grid([_draw_blind_tile(dataset.pair(index), tile_width_px) for index in frames], columns)
-
-
-def _grid(tiles: Sequence[Picture], columns: int) -> Picture:
-    """Equal tiles in rows."""
-    height_px, width_px = tiles[0].shape[:2]
-    rows = math.ceil(len(tiles) / columns)
-    shape = (rows * (height_px + _GAP_PX) + _GAP_PX, columns * (width_px + _GAP_PX) + _GAP_PX, 3)
-    sheet = np.full(shape, _PAPER, dtype=np.uint8)
+    sheet: Picture | None = None
     for place, tile in enumerate(tiles):
-        row, column = divmod(place, columns)
-        top, left = _GAP_PX + row * (height_px + _GAP_PX), _GAP_PX + column * (width_px + _GAP_PX)
-        sheet[top : top + height_px, left : left + width_px] = tile
+        height_px, width_px = tile.shape[0] + _GAP_PX, tile.shape[1] + _GAP_PX
+        if sheet is None:
+            size_px = shape[0] * height_px + _GAP_PX, shape[1] * width_px + _GAP_PX
+            _check_size(out, *size_px)
+            sheet = np.full((*size_px, 3), _PAPER, dtype=np.uint8)
+        row, column = divmod(place, shape[0])[::-1] if down else divmod(place, shape[1])
+        top, left = _GAP_PX + row * height_px, _GAP_PX + column * width_px
+        sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    assert sheet is not None
     return sheet
 
 
-def draw_family_sheet(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> tuple[Picture, int]:
+def _check_size(out: Path, height_px: int, width_px: int) -> None:
+    suffix, size = out.suffix.lower(), f"the sheet would be {width_px} x {height_px} px"
+    if height_px * width_px > _MOST_PX:
+        raise ValueError(f"--out: {size}, and {_MOST_PX} px in all are the most; lower --count or --tile-width")
+    if suffix != ".png" and max(height_px, width_px) > _MOST_JPEG_SIDE_PX:
+        raise ValueError(
+            f"--out: {size}, and a side of a {suffix} file has at most {_MOST_JPEG_SIDE_PX}; write a .png, or change "
+            "--columns"
+        )
+
+
+def _family_sheet(dataset: Dataset, out: Path, count: int, columns: int, tile_width_px: int) -> tuple[Picture, int]:
     """Left images without labels, a row for each family of conditions, with the distance of the drogue in a corner.
 
     Args:
         dataset: of the pairs.
+        out: file of the sheet.
         count: tiles at most; every family gets the same number, as long as it has pairs.
         columns: families side by side.
         tile_width_px: width of a tile; its height follows the images.
@@ -139,30 +149,26 @@ def draw_family_sheet(dataset: Dataset, count: int, columns: int, tile_width_px:
         (H, W, 3) in the order red, green, blue, and how many pairs it shows.
 
     Raises:
-        ValueError: an image or a record cannot be read.
+        ValueError: an image or a record cannot be read, or there are more families than tiles.
     """
     families: dict[str, list[int]] = {}
     for index in dataset.frame_indices:
         families.setdefault(dataset.record(index).conditions.family, []).append(index)
-    per_row = max(1, count // len(families))
-    blocks = [
-        _family_row(dataset, name, indices[:per_row], per_row, tile_width_px) for name, indices in families.items()
-    ]
-    height_px, width_px = blocks[0].shape[:2]
-    rows = math.ceil(len(blocks) / columns)
-    sheet = np.full((rows * (height_px + _GAP_PX), columns * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
-    for place, block in enumerate(blocks):
-        column, row = divmod(place, rows)
-        top, left = row * (height_px + _GAP_PX), column * (width_px + _GAP_PX)
-        sheet[top : top + height_px, left : left + width_px] = block
-    return sheet, sum(min(per_row, len(indices)) for indices in families.values())
+    if count < len(families):
+        raise ValueError(f"--count: must be at least {len(families)}, a pair for each family, got {count}")
+    length = min(count // len(families), max(map(len, families.values())))
+    shown = {name: indices[:length] for name, indices in families.items()}
+    rows = math.ceil(len(shown) / min(columns, len(shown)))
+    blocks = (_family_row(dataset, name, indices, length, tile_width_px) for name, indices in shown.items())
+    sheet = _grid(blocks, (rows, math.ceil(len(shown) / rows)), out, down=True)
+    return sheet, sum(map(len, shown.values()))
 
 
 def _family_row(dataset: Dataset, name: str, frames: Sequence[int], length: int, width_px: int) -> Picture:
     """A caption with the family's name over its tiles, from left to right."""
     tiles = [_plain_tile(dataset.images(index), dataset.record(index), width_px) for index in frames]
     height_px = tiles[0].shape[0]
-    row = np.full((_CAPTION_PX + height_px, length * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
+    row = np.full((_CAPTION_PX + height_px, length * (width_px + _GAP_PX) - _GAP_PX, 3), _PAPER, dtype=np.uint8)
     cv2.putText(row, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
     for place, tile in enumerate(tiles):
         left = place * (width_px + _GAP_PX)
