@@ -158,14 +158,14 @@ def _write_site(out: Path, facts: PageFacts, skipped: Sequence[UnreadablePair]) 
 
 
 def _remove_stale_files(out: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Remove pictures and labels that the catalogue does not name."""
+    """Remove pictures and labels that the catalogue does not name; folders, such as those of a NAS, are not ours."""
     kept = {str(row["picture"]) for row in rows}
     for path in (out / PICTURES_FOLDER).iterdir():
-        if path.name.rpartition("-")[0] not in kept:
+        if path.name.rpartition("-")[0] not in kept and not path.is_dir():
             path.unlink()
     labels = {_labels_file(out, row["labels"]).name for row in rows} | {"catalogue.js"}
     for path in (out / DATA_FOLDER).iterdir():
-        if path.name not in labels:
+        if path.name not in labels and not path.is_dir():
             path.unlink()
 
 

@@ -101,6 +101,17 @@ def test_a_second_run_keeps_pictures_and_makes_missing_ones(tiny: Path, tmp_path
     assert contents(page) == before
 
 
+def test_folders_of_others_in_the_page_stay(tiny: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page"
+    write_browse(tiny, page, None, 0, told())
+    for folder in ("pictures", "data"):
+        (page / folder / "@eaDir").mkdir()
+        (page / folder / "old.txt").touch()
+    write_browse(tiny, page, None, 0, told())
+    for folder in ("pictures", "data"):
+        assert (page / folder / "@eaDir").is_dir() and not (page / folder / "old.txt").exists()
+
+
 def test_pictures_of_other_pixels_are_replaced(tiny: Path, tmp_path: Path) -> None:
     other = rendered(recipe_text(SINGLE_PAIRS, seed=3), tmp_path / "other")
     write_browse(tiny, tmp_path / "page", None, 0, told())
