@@ -34,6 +34,8 @@ ALLOWED_FAILURES = 9
 # Enough that no worker waits for the client, and few enough that the scheduler's memory is independent of the recipe.
 _FRAMES_PER_WORKER = 2
 _CONNECT_S = 30
+# After its time a client takes a moment to say why it failed. [s]
+_ANSWER_S = 5
 # What stands in the queue of ended frames for a request to stop.
 _STOP = -1
 # Least time between two questions for the number of workers: the scheduler's answer is slower than a frame's report.
@@ -304,7 +306,7 @@ def _connect(address: str, stop: StopRequest) -> Client | None:
     threading.Thread(target=connect, daemon=True).start()
     stop.wake = lambda: answers.put(None)
     try:
-        answer = None if stop.is_requested else answers.get(timeout=_CONNECT_S)
+        answer = None if stop.is_requested else answers.get(timeout=_CONNECT_S + _ANSWER_S)
     except Empty:
         answer = OSError(f"what listens there said nothing for {_CONNECT_S} s")
     if isinstance(answer, Exception):

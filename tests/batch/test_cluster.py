@@ -158,10 +158,19 @@ def test_a_port_where_something_else_listens_is_given_up(
     silence: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(cluster, "_ANSWER_S", 0.5)
     address = f"tcp://127.0.0.1:{silence.getsockname()[1]}"
     with pytest.raises(OSError, match=rf"--scheduler: no Dask scheduler answers at {address}: what listens there said"):
         render_on(address, tmp_path / "out", OnFrame(0, lambda: None))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_port_where_nothing_listens_is_said_to_refuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
+    with pytest.raises(OSError, match=rf"--scheduler: no Dask scheduler answers at {address}: (?!what listens)"):
+        render_on(address, tmp_path / "out", OnFrame(0, lambda: None))
 
 
 def test_a_request_to_stop_ends_the_wait_for_the_scheduler(silence: socket.socket, tmp_path: Path) -> None:
