@@ -91,9 +91,9 @@ def _pictures(datasets: tuple[Location, Location]) -> Iterator[_ShownPair]:
     for place in range(_SHOWN_PAIRS):
         for letter, source in zip("AB", sources, strict=True):
             indices = source.frame_indices
-            if not indices:
+            if place >= len(indices):
                 continue
-            index = indices[place * len(indices) // _SHOWN_PAIRS]
+            index = indices[place * len(indices) // min(_SHOWN_PAIRS, len(indices))]
             picture = cv2.cvtColor(resized(display_picture(source.images(index)), _TILE_PX)[0], cv2.COLOR_RGB2BGR)
             data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
             yield _ShownPair(base64.b64encode(data).decode(), f"{letter}, pair {index}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from itertools import pairwise
 from pathlib import Path
@@ -52,6 +53,16 @@ def test_a_copy_is_the_same(dataset: Path, tmp_path: Path, capsys: pytest.Captur
     assert found.recipe == () and found.manifest == () and found.same_frames == 20
     assert all(each.p == 1.0 for each in found.pixels)
     assert page.read_text().count("<figure>") == 8
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_the_page_shows_each_pair_once(count: int, dataset: Path, tmp_path: Path) -> None:
+    small = made(tmp_path / "small", frames={"count": count, "scenes": 1})
+    page = tmp_path / "diff.html"
+    run(["diff", str(dataset), str(small), "--html", str(page)])
+    shown = re.findall(r"<figcaption>([AB]), pair (\d+)", page.read_text())
+    assert len(shown) == len(set(shown)) == 4 + min(count, 4)
+    assert shown[:2] == [("A", "0"), ("B", "0")]
 
 
 def test_another_seed_of_a_recipe_does_not_differ(dataset: Path, tmp_path: Path) -> None:
