@@ -149,9 +149,11 @@ def known_looks(dataset: Dataset, report: ProgressReport) -> KnownLooks:
     """The looks of up to 240 left pictures of a dataset, spread over it.
 
     Raises:
-        ValueError: a picture or record cannot be read, or all are of one scene; names the dataset.
+        ValueError: there are no pictures, one or its record cannot be read, or all are of one scene; names the dataset.
     """
     indices = dataset.frame_indices
+    if not indices:
+        raise ValueError(f"{dataset.path}: holds no pairs yet")
     chosen: list[int] = [indices[k * len(indices) // _MOST_PICTURES] for k in range(_MOST_PICTURES)]
     chosen = sorted(set(chosen if len(indices) > _MOST_PICTURES else indices))
     looks, families, scenes = list[NDArray[np.float64]](), list[str](), list[int]()

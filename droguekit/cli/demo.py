@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from datasets_manifest.storage.manifest import read_manifest
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DeviceOption, RecipeArgument, WorkersOption
@@ -36,8 +37,8 @@ def demo(
 ) -> None:
     """Render a small dataset of a drogue from 40 m down to 1.7 m, estimate poses without the truth, and write a report.
 
-    Writes dataset/, estimates.jsonl, benchmark.json and report.html. The first 12 pairs get a report at once; then all.
-    Run again, it keeps pairs that exist.
+    Writes dataset/, estimates.jsonl, benchmark.json and report.html. The first 12 pairs get a report at once, if one of
+    them has a drogue; then all. Run again, it keeps pairs that exist.
     """
     dataset, estimates, numbers, page = (
         out / name for name in ("dataset", "estimates.jsonl", "benchmark.json", "report.html")
@@ -49,6 +50,10 @@ def demo(
         summary = render_frames(source, dataset, range(pairs), ExecutionOptions(workers, device=device), show)
         if summary.pairs > pairs:
             continue  # an earlier run went further
+        counts = read_manifest(dataset).counts
+        if pairs < count and counts.pairs == counts.empty:
+            show.say(f"no drogue in the first {pairs} pairs, so there is no first report; going on to {count}")
+            continue
         show.say("2 of 3: estimating poses by every method, without the truth")
         navigate_dataset(dataset, (), estimates, show)
         show.say("3 of 3: comparing the estimates with the truth")

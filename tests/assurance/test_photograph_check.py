@@ -13,6 +13,8 @@ import pytest
 from pycocotools.coco import COCO
 
 from datasets_manifest.importers.photographs import find_photographs
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.reader import Dataset
 from droguekit.assurance.photograph_check import PhotographCheck, check_lines, check_photographs
 from droguekit.assurance.picture_looks import LOOKS, KnownLooks, measure_looks
@@ -20,6 +22,9 @@ from droguekit.batch.progress import progress_report
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.scoring.report.label_drawing import display_picture
 from nav.training.negative_photographs import read_photographs
+from render.version import RENDER_VERSION
+from scenes.sampler import split_of_scenes
+from tests.support.recipe_builder import between, recipe_text
 
 Make = Callable[..., Path]
 RECIPE = """
@@ -111,6 +116,15 @@ def test_the_command_writes_page_and_numbers(photographs: Path, rendered: Path, 
     assert all(name in text for name in ("a.png", "more/c.tiff", "broken.jpg")) and text.count("<img") == 5
     assert "http" not in text.replace("http://www.w3.org", "")
     assert PhotographCheck.model_validate_json(numbers.read_text()).known == "near"
+
+
+def test_known_pictures_of_a_dataset_without_pairs_are_refused(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = parse_recipe(recipe_text(name="none", frames={"count": 4}, distance=between(3.0, 12.0)))
+    write_manifest(tmp_path, build_manifest(tmp_path, recipe, RENDER_VERSION, split_of_scenes(recipe)))
+    assert run(["real-check", str(photographs), "--known", str(tmp_path)]) == WRONG_INPUT
+    assert f"{tmp_path}: holds no pairs yet" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

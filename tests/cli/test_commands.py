@@ -167,6 +167,20 @@ def test_demo_reports_a_few_pairs_first(
 
 
 @pytest.mark.slow
+def test_demo_goes_on_where_its_first_pairs_show_no_drogue(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("droguekit.cli.demo._FIRST_PAIRS", 2)
+    frames = {"count": 6, "empty_fraction": 0.6}
+    (tmp_path / "small.toml").write_text(recipe_text(SINGLE_PAIRS, frames=frames, seed=2))
+    out = tmp_path / "out"
+    assert run(["demo", str(tmp_path / "small.toml"), "--out", str(out), "--workers", "0"]) == DONE
+    assert "no drogue in the first 2 pairs, so there is no first report; going on to 6" in capsys.readouterr().err
+    assert [entry.empty for entry in read_manifest(out / "dataset").frames][:2] == [True, True]
+    assert json.loads((out / "benchmark.json").read_text())["dataset"]["pairs"] == 6
+
+
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_the_slow_variant_is_announced_and_no_other_one_continues_its_dataset(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
