@@ -44,7 +44,8 @@ class TrainingSettings(FrozenModel):
         hard_fraction: of the samples of an epoch, whole images or the first of a mosaic, so many make way for pairs in
             which the weights that the training starts from fail (`nav.training.hard_pairs`).
         size_px: (height, width) of the network's input.
-        final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`.
+        final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`. A smaller one has
+            the same shape.
         image_passes: number of images that pass forwards and backwards through the network in the whole training.
         batch_images: number of images in a step; even for `both` views.
         optimizer, learning_rate, weight_decay: of the optimizer; the learning rate is the peak of the schedule.

@@ -58,6 +58,8 @@ _REFINEMENTS, _REFINEMENTS_THIN = ((2, 0.08), (1, 0.35)), ((1, 0.05),)
 # A pixel that looks along so much of a swell begins to sparkle, and along so much of it does nothing else; so many
 # neighbours, an odd number, are averaged.
 _SPARKLES_FROM, _SPARKLES, _SPARKLE_PX = 0.04, 0.25, 31
+# Rays that rise so much more than those that miss a layer look along nearly as much of it as any. [sine]
+_FLAT_RISE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -318,16 +320,21 @@ class CloudLayerRenderer:
         There each ray meets the layer at random, and the picture would sparkle. Neighbours beside each other meet what
         other rays of the pixel would.
         """
-        rise = directions[..., 2] * np.float32(self._where.sign)
-        share = np.clip(self._where.pixel_length_m(rise, pixel_rad) / cloud_shape(self._layer).numbers[5], 0.0, 1.0)
-        share = np.clip((share - _SPARKLES_FROM) / (_SPARKLES - _SPARKLES_FROM), 0.0, 1.0).astype(np.float32)
-        rows = np.flatnonzero(share.any(axis=1))
+        where, swell_m = self._where, cloud_shape(self._layer).numbers[5]
+        rise = directions[..., 2] * np.float32(where.sign)
+        # The flattest ray of a row looks along most.
+        flattest = np.maximum(rise.min(axis=1), np.float32(where.least_rise + _FLAT_RISE))
+        looks_along = where.pixel_length_m(flattest, pixel_rad) > _SPARKLES_FROM * swell_m
+        rows = np.flatnonzero(looks_along & (rise.max(axis=1) > where.least_rise))
         if not len(rows):
             return picture
-        steps = [np.abs(np.diff(rise, axis=axis)).mean() for axis in (0, 1)]
-        size = (_SPARKLE_PX, 1) if steps[1] < steps[0] else (1, _SPARKLE_PX)
         part = slice(rows[0], rows[-1] + 1)
-        picture[part] += share[part, :, None] * (cv2.GaussianBlur(picture[part], size, 0) - picture[part])
+        rise = rise[part]
+        swells = where.pixel_length_m(rise, pixel_rad) / np.float32(swell_m)
+        share = np.clip((swells - _SPARKLES_FROM) / (_SPARKLES - _SPARKLES_FROM), 0.0, 1.0).astype(np.float32)
+        down, across = abs(rise[-1] - rise[0]).mean() / len(rise), abs(rise[:, -1] - rise[:, 0]).mean() / rise.shape[1]
+        size = (_SPARKLE_PX, 1) if across < down else (1, _SPARKLE_PX)
+        picture[part] += share[..., None] * (cv2.GaussianBlur(picture[part], size, 0) - picture[part])
         return picture
 
     def _starts(self, entry_m: _Field | None, every: int, indices: NDArray[np.int64], width: int) -> _Field | None:
