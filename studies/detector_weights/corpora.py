@@ -66,8 +66,27 @@ _CONES_TARGET = {
     ],
     "distractor_forms": ["roundel", "roundel", "disc", "disc", "ball", "bird", "ring", "wheel"],
 }
+# Small cones fill few pixels from afar; these come near, and most are orange, which trainings find hardest to tell from
+# roundels.
+NEAR_CONES = {
+    "name": "detector-near-cones",
+    "seed": 13,
+    "frames": {"count": 320, "scenes": 107, "empty_fraction": 0.15},
+    "distance": {"low_m": 2.0, "high_m": 14.0},
+    "split": {"train": 0.9, "val": 0.1, "test": 0},
+}
+_NEAR_CONES_TARGET = {
+    **_CONES_TARGET,
+    "variants": [
+        {"drogue": "cone-orange", "weight": 12},
+        {"drogue": "cone-white", "weight": 3},
+        {"drogue": "cone-markers", "weight": 3},
+        {"drogue": "basket-small-orange", "weight": 2},
+        {"drogue": "red-8"},
+    ],
+}
 # Behind the later ones of `more-scenes.toml`.
-NEWEST_SCENES = 492
+NEWEST_SCENES, LAST_SCENES = 492, 560
 # Beside the photographs from the third training on.
 PLAIN_GROUNDS = 24
 # Frames without a drogue, two images each, to count false boxes in: the test set's, but for scenes and seed.
@@ -97,6 +116,7 @@ _FIRST, _SECOND = ("corpus", "more"), ("corpus", "more", "negatives", "flat")
 _FOURTH = ("later-corpus", "later-more", "later-negatives", "missed", "flat")
 _SIXTH = (*_FOURTH, "negatives", "round")
 _SEVENTH = (*_SIXTH, "cones", "newest-more")
+_EIGHTH = (*_SEVENTH, "later-missed")
 _THREE = (Training("first", _FIRST), Training("second", _SECOND), Training("third", _SECOND, has_grounds=True))
 # A fifth training led nowhere, see RESULTS.md.
 TRAININGS: dict[str, tuple[Training, ...]] = {
@@ -106,7 +126,8 @@ TRAININGS: dict[str, tuple[Training, ...]] = {
         Training("fourth", _FOURTH, has_grounds=True),
         Training("sixth", _SIXTH, has_grounds=True),
         Training("seventh", _SEVENTH, has_grounds=True),
-        Training("eighth", (*_SEVENTH, "later-missed"), has_grounds=True),
+        Training("eighth", _EIGHTH, has_grounds=True),
+        Training("ninth", (*_EIGHTH, "near-cones", "last-more"), has_grounds=True),
     ),
 }
 
@@ -125,7 +146,8 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
         "flat": load_recipe("detector-small", changes=FLAT),
         "later-corpus": load_recipe("detector-train", changes=LATER_CORPUS),
         "round": load_recipe(test, changes=ROUND),
-        "cones": _cones(),
+        "cones": _cones(CONES, _CONES_TARGET),
+        "near-cones": _cones(NEAR_CONES, _NEAR_CONES_TARGET),
         "test": load_recipe(test),
         "empty": load_recipe(test, changes=EMPTY),
     }
@@ -136,6 +158,7 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
         "negatives": (negatives, frames_of_first_scenes(negatives.recipe, NEGATIVE_SCENES)),
         "later-negatives": (negatives, _frames_behind(negatives.recipe, NEGATIVE_SCENES, LATER_NEGATIVE_SCENES)),
         "newest-more": (more, _frames_behind(more.recipe, LATER_SCENES, NEWEST_SCENES)),
+        "last-more": (more, _frames_behind(more.recipe, NEWEST_SCENES, LAST_SCENES)),
         "missed": (missed, frames_of_first_scenes(missed.recipe, MISSED_SCENES)),
         "later-missed": (missed, _frames_behind(missed.recipe, MISSED_SCENES, ALL_MISSED_SCENES)),
         **{name: (source, range(source.recipe.frames.count)) for name, source in whole.items()},
@@ -144,12 +167,12 @@ def datasets(variant: str) -> dict[str, tuple[RecipeSource, Sequence[int]]]:
     return {name: dataset for name, dataset in every.items() if name in needed}
 
 
-def _cones() -> RecipeSource:
+def _cones(changes: dict[str, object], target: dict[str, object]) -> RecipeSource:
     """The family of multirotors of `missed-scenes.toml` alone, with other drogues and distractors."""
     path = _HERE / "missed-scenes.toml"
     families = tomllib.loads(path.read_text(encoding="utf-8"))["families"]
     family = next(each for each in families if each["name"] == "multirotor")
-    return load_recipe(str(path), changes={**CONES, "families": [{**family, "target": _CONES_TARGET}]})
+    return load_recipe(str(path), changes={**changes, "families": [{**family, "target": target}]})
 
 
 def _frames_behind(recipe: Recipe, first: int, last: int) -> list[int]:

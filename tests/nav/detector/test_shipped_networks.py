@@ -13,7 +13,7 @@ from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
 from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
-from studies.detector_weights.corpora import CONES, FLAT, ROUND
+from studies.detector_weights.corpora import CONES, FLAT, NEAR_CONES, ROUND
 
 NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 ROOT = Path(__file__).parents[3]
@@ -24,6 +24,7 @@ RECIPES = {
     "detector-weights": (str(STUDY / "more-scenes.toml"), {}),
     "detector-missed": (str(STUDY / "missed-scenes.toml"), {}),
     "detector-cones": (str(STUDY / "missed-scenes.toml"), CONES),
+    "detector-near-cones": (str(STUDY / "missed-scenes.toml"), NEAR_CONES),
     "detector-round": (str(STUDY / "test.toml"), ROUND),
     "detector-flat": ("detector-small", FLAT),
 }
