@@ -160,9 +160,9 @@ def test_without_a_drogue_to_validate_with_only_the_end_is_validated(
         return validate(trainer, state, size_px)
 
     monkeypatch.setattr(Trainer, "_validate", counted)
-    # Three epochs of 80 images.
-    run(toy_dataset, tmp_path, image_passes=240)
-    assert done == [60]
+    # An epoch of 80 images and a step of another.
+    run(toy_dataset, tmp_path, image_passes=84)
+    assert done == [21]
 
 
 def test_a_process_that_is_killed_ends_the_training_in_one_line(split_dataset: Path, tmp_path: Path) -> None:
