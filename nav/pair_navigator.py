@@ -74,7 +74,8 @@ RIM_METHODS = frozenset({"joint-rim"})
 _LEAST_MARKERS = 3
 # The best rotation must fit the pairs within this share of the gap between neighbours; a wrong one is off by a gap.
 _LARGEST_COST_FRACTION = 0.35
-# Largest scale of a ring, which is drawn out at the side of a wide image, over focal length by distance.
+# Largest scale of a ring, which is drawn out at the side of a wide image, over focal length by distance. Tilted by up
+# to 20 degrees it reaches 1.38 in images of 1280 px with a focal length of 500 px.
 _LARGEST_STRETCH = 1.5
 # Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
 # have 0.033 of the gap at most.

@@ -7,7 +7,9 @@ import io
 import json
 import uuid
 from pathlib import Path
+from typing import Any
 
+import cv2
 import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -17,6 +19,7 @@ from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.types.estimates import PoseEstimate, read_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.scoring.detection.detection_truth import read_detection_truth
+from nav.detector.ring_detectors import ColorBlobDetector
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +27,26 @@ def detections(smoke_dataset: Path, tmp_path_factory: pytest.TempPathFactory) ->
     out = tmp_path_factory.mktemp("detect") / "boxes.json"
     assert run(["detect", str(smoke_dataset), "--detector", "color-blob", "--out", str(out)]) == DONE
     return out
+
+
+def test_times_are_of_one_thread(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, search = set(), ColorBlobDetector.candidates
+
+    def counted(detector: ColorBlobDetector, *arguments: Any) -> Any:
+        threads.add(cv2.getNumThreads())
+        return search(detector, *arguments)
+
+    monkeypatch.setattr(ColorBlobDetector, "candidates", counted)
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        for command, file in (("detect", "--out"), ("benchmark", "--json")):
+            options = ["--detector", "color-blob", file, str(tmp_path / f"{command}.json")]
+            assert run([command, str(smoke_dataset), *options]) == DONE
+            assert threads == {1}
+            threads.clear()
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_boxes_have_the_image_ids_of_the_annotations_and_agree_with_them_by_pycocotools(
