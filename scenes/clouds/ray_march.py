@@ -20,6 +20,9 @@ _SURFACE_ITERATIONS = 3
 MOST_DEPTH = 2.6
 _NOWHERE_M = 1e9
 _SUN_STEPS = 5
+# A ray that grazes a rim goes on to another cloud. So many clouds are told apart; one with less of what is seen than
+# this has no say in how bright that is. Their mean light is that of a beam with this share of the extinction.
+_PARTS, _LEAST_PART, _EVEN_EXTINCTION, _LEAST_LIGHT = 4, 0.1, 0.2, 1e-30
 # Each octave of lumps is finer by this factor and turned by these cosines and sines about two axes.
 _FINER = 2.13
 _MASK, _TILE_PX, _LUMPS_MASK = 511, 512.0, 63
@@ -181,6 +184,41 @@ def _height_m(z: float, distance_m: float, bend: float, base_m: float) -> float:
 
 
 @compiled
+def _depth_towards(
+    shape: NDArray[np.float64],
+    body: NDArray[np.float32],
+    lumps: NDArray[np.float32],
+    x_m: float,
+    y_m: float,
+    height_m: float,
+    sun: NDArray[np.float64],
+    detail_m: float,
+    extinction: float,
+) -> float:
+    """Optical depth from a place towards the sun, in steps that grow up to the layer's thickness."""
+    softness_m, thick_m = shape[11], shape[2]
+    way_m, step_m, towards = 0.0, max(5.0, detail_m), 0.0
+    for step in range(_SUN_STEPS):
+        middle_m = way_m + 0.5 * step_m
+        inner = excess_at(
+            shape,
+            body,
+            lumps,
+            x_m + sun[0] * middle_m,
+            y_m + sun[1] * middle_m,
+            height_m + sun[2] * middle_m,
+            max(2.0 * detail_m, 0.5 * step_m),
+        )
+        soft_m = max(5.0 * softness_m, 0.5 * step_m)
+        towards += min(max(inner / soft_m, 0.0), 1.0) * extinction * step_m
+        way_m += step_m
+        step_m *= 2.6
+        if step == _SUN_STEPS - 2:
+            step_m = max(step_m, 0.8 * thick_m - way_m)
+    return towards
+
+
+@compiled
 def march_rays(
     shape: NDArray[np.float64],
     body: NDArray[np.float32],
@@ -202,16 +240,20 @@ def march_rays(
         sun: (3,) unit vector.
         found: (N, 6) filled in: optical depth, distance of the visible cloud [m], optical depth from there towards the
             sun, height there over the layer's thickness, how far it stands out of the larger shape [m], and the
-            distance at which the ray enters cloud [m].
+            distance at which the ray enters cloud [m]. Where a ray sees several clouds behind each other, these are
+            means over the clouds, the depth towards the sun that of their mean light.
     """
     east_m, north_m, base_m, bend = place[0], place[1], place[2], place[3]
     pixel_rad, extinction = place[4], place[5]
     thick_m, softness_m = shape[2], shape[11]
     layer_m = abs(base_m) + thick_m
+    # Of each part of the ray that is inside: how much of what is seen it is, and that times its distance.
+    parts = np.zeros((_PARTS, 2))
     for index in range(rays.shape[0]):
         x, y, z = float(rays[index, 0]), float(rays[index, 1]), float(rays[index, 2])
         near_m, far_m = float(ends_m[index, 0]), float(ends_m[index, 1])
-        at_m, before_m, depth, weighted_m, weight = near_m, near_m, 0.0, 0.0, 0.0
+        at_m, before_m, depth, part = near_m, near_m, 0.0, 0
+        parts[:] = 0.0
         inside, steps, outside_m, entry_m = False, 0, -1.0, _NOWHERE_M
         while at_m < far_m and depth < MOST_DEPTH and steps < _MOST_STEPS:
             steps += 1
@@ -221,6 +263,8 @@ def march_rays(
             height_m = _height_m(z, at_m, bend, base_m)
             deep_m = excess_at(shape, body, lumps, x * at_m + east_m, y * at_m + north_m, height_m, detail_m)
             if deep_m <= 0.0:
+                if inside and parts[part, 0] > 0.0:
+                    part = min(part + 1, _PARTS - 1)
                 inside = False
                 before_m, outside_m = at_m, min(deep_m, -1e-3)
                 at_m += max(-0.7 * deep_m, least_m, 1.5 * detail_m, 3.0)
@@ -253,42 +297,35 @@ def march_rays(
             dense *= dense
             more = dense * extinction * step_m
             hides = np.exp(-depth) * (1.0 - np.exp(-more))
-            weighted_m += hides * middle_m
-            weight += hides
+            parts[part, 0] += hides
+            parts[part, 1] += hides * middle_m
             depth += more
             before_m, outside_m = at_m, -1e-3
             at_m += step_m
         found[index, 0] = depth
         found[index, 5] = entry_m
+        weight = parts[:, 0].sum()
         if weight <= 0.0:
             found[index, 1] = near_m
             found[index, 2:5] = 0.0
             continue
-        at_m = weighted_m / weight
-        detail_m = at_m * pixel_rad
-        px, py, pz = x * at_m + east_m, y * at_m + north_m, _height_m(z, at_m, bend, base_m)
-        way_m, step_m, towards = 0.0, max(5.0, detail_m), 0.0
-        for step in range(_SUN_STEPS):
-            middle_m = way_m + 0.5 * step_m
-            inner = excess_at(
-                shape,
-                body,
-                lumps,
-                px + sun[0] * middle_m,
-                py + sun[1] * middle_m,
-                pz + sun[2] * middle_m,
-                max(2.0 * detail_m, 0.5 * step_m),
-            )
-            soft_m = max(5.0 * softness_m, 0.5 * step_m)
-            towards += min(max(inner / soft_m, 0.0), 1.0) * extinction * step_m
-            way_m += step_m
-            step_m *= 2.6
-            if step == _SUN_STEPS - 2:
-                step_m = max(step_m, 0.8 * thick_m - way_m)
-        found[index, 1] = at_m
-        found[index, 2] = towards
-        found[index, 3] = pz / thick_m
-        found[index, 4] = lumps_at(shape, lumps, px, py, pz, detail_m)
+        seen, through, height, relief = 0.0, 0.0, 0.0, 0.0
+        for which in range(part + 1):
+            share = parts[which, 0] / weight
+            if share < _LEAST_PART:
+                continue
+            at_m = parts[which, 1] / parts[which, 0]
+            detail_m = at_m * pixel_rad
+            px, py, pz = x * at_m + east_m, y * at_m + north_m, _height_m(z, at_m, bend, base_m)
+            towards = _depth_towards(shape, body, lumps, px, py, pz, sun, detail_m, extinction)
+            seen += share
+            through += share * np.exp(-_EVEN_EXTINCTION * towards)
+            height += share * pz / thick_m
+            relief += share * lumps_at(shape, lumps, px, py, pz, detail_m)
+        found[index, 1] = parts[:, 1].sum() / weight
+        found[index, 2] = -np.log(max(through / seen, _LEAST_LIGHT)) / _EVEN_EXTINCTION
+        found[index, 3] = height / seen
+        found[index, 4] = relief / seen
 
 
 @compiled

@@ -9,6 +9,7 @@ from datasets_manifest.types.environment import CloudKind, CloudLayer, Environme
 from scenes.clouds.cloud_layers import (
     CloudLayerRenderer,
     CloudLight,
+    LayerGeometry,
     cloud_shape,
     cloud_share,
     diffuse_transmission,
@@ -16,7 +17,7 @@ from scenes.clouds.cloud_layers import (
     render_cloud_layer,
 )
 from scenes.clouds.cloud_textures import ice_tiles, lump_volume, power_law_tile
-from scenes.clouds.ray_march import HIGHEST_LUMP, layer_excess, march_rays
+from scenes.clouds.ray_march import HIGHEST_LUMP, MOST_DEPTH, layer_excess, march_rays
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.sky.photometry import direction_from_angles, luminance
@@ -310,6 +311,33 @@ def test_what_is_seen_of_a_large_picture_is_what_single_rays_see(
     # Cumulus, whose finest knobs are as wide as the rays that are interpolated, reaches 0.023 and 0.004.
     assert off.mean(axis=(0, 1)).max() < 0.03
     assert (off > 0.35).mean(axis=(0, 1)).max() < 0.005
+
+
+@pytest.mark.parametrize("kind", ["cumulus", "congestus"])
+def test_rims_before_other_clouds_are_not_lit_like_the_air_between(kind: str) -> None:
+    """A ray that grazes one cloud and ends in another sees light of both, not of a place in the open between them."""
+    cloud, pixel_rad = layer(kind=kind, thickness_m=900.0, feature_size_m=900.0, cover_fraction=0.5), 1.0 / 400.0
+    shape, where, rays = cloud_shape(cloud), LayerGeometry(cloud), looking(320, 240, 400.0, 25.0).reshape(-1, 3)
+    place = np.array([0.0, 0.0, where.base_m, where.bend_per_m, pixel_rad, shape.extinction_per_m])
+
+    def marched(from_m: np.ndarray, to_m: np.ndarray) -> np.ndarray:
+        found, ends_m = np.zeros((len(rays), 6), dtype=np.float32), np.stack([from_m, to_m], axis=-1)
+        march_rays(shape.numbers, shape.body, shape.lumps, rays, ends_m, place, SIDE_LIGHT.direction, found)
+        return found
+
+    near_m, far_m = where.crossing(rays[:, 2])
+    whole = marched(near_m, far_m)
+    between_m = whole[:, 1]
+    front, back = marched(near_m, between_m), marched(between_m, far_m)
+    places_m = (between_m[:, None] * rays).astype(np.float64)
+    places_m[:, 2] += where.bend_per_m * between_m.astype(np.float64) ** 2 - where.base_m
+    in_the_open = layer_excess(shape.numbers, shape.body, shape.lumps, places_m, 2.5) < -30.0
+    rims = in_the_open & (front[:, 0] > 0.2) & (back[:, 0] > 0.5) & (whole[:, 0] > MOST_DEPTH)
+    assert rims.sum() > 500
+    depths = np.stack([front[rims, 2], back[rims, 2]])
+    # Either half may itself hold more than one cloud.
+    low, high = 0.9 * depths.min(axis=0) - 0.05, 1.1 * depths.max(axis=0) + 0.05
+    assert np.mean((whole[rims, 2] > low) & (whole[rims, 2] < high)) > 0.99
 
 
 @pytest.mark.parametrize(("kind", "thickness_m"), [("stratus", 400.0), ("altocumulus", 200.0), ("cumulus", 600.0)])
