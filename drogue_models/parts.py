@@ -35,6 +35,8 @@ class Part(IntEnum):
 
 # Parts around the drogue, outside its box.
 SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR, Part.BOARD)
+# Parts of the receiver, which fly with its cameras.
+RECEIVER_PARTS = (Part.PROBE, Part.OBSTACLE)
 # Parts that the drogue's box covers, besides the markers.
 DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB, Part.LAMPS)
 

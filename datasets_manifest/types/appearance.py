@@ -63,7 +63,10 @@ class DrogueCondition(FrozenModel):
 
 
 class Obstacle(FrozenModel):
-    """A body in the picture that is neither drogue, hose nor tanker; during the exposure it moves with the drogue.
+    """A body in the picture that is neither drogue, hose nor tanker.
+
+    During the exposure `probe` and `obstacle` keep their places before the camera, and a `distractor` that beside the
+    drogue.
 
     Attributes:
         kind: `probe` of the receiver, `obstacle` close to the cameras, or `distractor` that resembles a drogue.

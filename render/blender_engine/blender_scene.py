@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import mathutils
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,6 +125,7 @@ class BlenderScene:
     Attributes:
         scenes: by kind of picture.
         camera: the one camera of all of them.
+        carried: objects that fly with the camera.
         device: that Cycles renders on, `CPU` or `GPU`.
     """
 
@@ -142,6 +144,7 @@ class BlenderScene:
         self._sun.rotation_mode = "QUATERNION"
         self._sun.data.angle = 0.0
         self._sky = _Sky()
+        self.carried: list[Any] = []
         self._objects: dict[str, Any] = {}
         self._surfaces: dict[str, SurfaceMaterial] = {}
         probe = _probe_material()
@@ -177,6 +180,7 @@ class BlenderScene:
             self._objects[name].data.materials.append(self._surfaces[name].material)
             for kind in (LIGHT, PASSES):
                 self.scenes[kind].collection.objects.link(self._objects[name])
+        self.carried = [self._objects[name] for name, part in stage.objects.items() if part.flies_with_camera]
         for name, part in stage.features.items():
             self.scenes[FEATURES].collection.objects.link(_mesh_object(name, part))
 
@@ -326,6 +330,7 @@ def render_picture(scene: BlenderScene, request: PictureRequest) -> None:
     target = scene.scenes[request.kind]
     _set_lens(scene.camera.data, request)
     _set_path(scene.camera, request.path)
+    _carry(scene.carried, scene.camera, request.path)
     _set_output(target, request)
     _set_sampling(target, request, scene.device)
     target.render.use_motion_blur = len(request.path.positions_m) > 1
@@ -362,6 +367,17 @@ def _set_path(camera: Any, path: CameraPath) -> None:
         camera.location, camera.rotation_quaternion = position, quaternion
         camera.keyframe_insert("location", frame=moment)
         camera.keyframe_insert("rotation_quaternion", frame=moment)
+
+
+def _carry(objects: list[Any], camera: Any, path: CameraPath) -> None:
+    """Let objects fly with the camera while it moves, from their places at mid-exposure."""
+    count = len(path.positions_m)
+    turned = mathutils.Quaternion(path.quaternions[count // 2].tolist()).to_matrix().to_4x4()
+    stage_from_camera = mathutils.Matrix.Translation(path.positions_m[count // 2].tolist()) @ turned
+    for item in objects:
+        item.parent = camera if count > 1 else None
+        item.matrix_parent_inverse = stage_from_camera.inverted()
+        item.cycles.motion_steps = camera.cycles.motion_steps
 
 
 def _set_output(scene: Any, request: PictureRequest) -> None:

@@ -33,6 +33,7 @@ class PartMesh:
         smooth: whether normals are interpolated over the faces.
         map_uv: (V, 2) float32 texture coordinates, 0 to 1 from first column and row of the reflectance map, or None.
         normals: (V, 3) float32 unit normals to interpolate, or None for those of the faces around each vertex.
+        flies_with_camera: whether it keeps its place in the camera's axes while the shutter is open.
     """
 
     part_id: int
@@ -41,6 +42,7 @@ class PartMesh:
     smooth: bool
     map_uv: NDArray[np.float32] | None = None
     normals: NDArray[np.float32] | None = None
+    flies_with_camera: bool = False
 
 
 @dataclass(frozen=True, eq=False)

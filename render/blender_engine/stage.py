@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import PaintedMesh
+from drogue_models.parts import RECEIVER_PARTS
 from geometry.se3 import Array, RigidTransform
 from render.blender_engine.messages import (
     FrameSetup,
@@ -118,6 +119,7 @@ def _part_mesh(surface: Surface, placed: MovedMesh) -> PartMesh:
         smooth=painted.smooth,
         map_uv=placed.map_uv,
         normals=placed.normals,
+        flies_with_camera=surface.part_id in RECEIVER_PARTS,
     )
 
 

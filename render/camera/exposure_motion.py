@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.parts import RECEIVER_PARTS
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import Eye, StereoRig
 
@@ -44,6 +46,44 @@ def motion_blur_px(frame: FrameSpec) -> float:
         places_m = np.array([obstacle.left_from_object.translation_m for obstacle in frame.bystanders])
     seen = [frame.rig.camera.project(frame.left_from_stage_at(s).apply(places_m)) for s in (-half_s, 0.0, half_s)]
     return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
+
+
+def receiver_pixels(
+    frame: FrameSpec, eye: Eye, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Where parts of the receiver would be seen during the exposure if they stood in the stage's axes, as drawn.
+
+    They fly with the cameras and stay sharp: what is seen here is that of mid-exposure.
+
+    Args:
+        frame: rig, exposure and motion.
+        eye: which image.
+        part_id: (H, W) part ids at mid-exposure.
+        distance_m: (H, W) distances along the rays there. [m]
+
+    Returns:
+        (H, W) pixels of the receiver's parts, and those around them as far as their image would move.
+    """
+    held = np.zeros(part_id.shape, dtype=np.bool_)
+    pose = pose_polynomial(frame, eye)
+    for part in RECEIVER_PARTS:
+        rows, columns = np.nonzero((part_id == part) & np.isfinite(distance_m))
+        if not len(rows):
+            continue
+        rays = frame.rig.rays(np.stack([columns, rows], axis=-1).astype(np.float64), eye)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        in_stage_m = rays * distance_m[rows, columns, None] @ pose[0, :, :3].T + pose[0, :, 3]
+        reach_px = 0.0
+        for s in (-1.0, 1.0):
+            moved = RigidTransform.from_matrix(np.vstack([pose[0] + s * pose[1] + pose[2], [0.0, 0.0, 0.0, 1.0]]))
+            seen_m = moved.inverse().apply(in_stage_m)
+            seen_m[:, 2] = np.maximum(seen_m[:, 2], NEAREST_M)
+            shift_px = frame.rig.camera.project(seen_m) - frame.rig.camera.project(rays)
+            reach_px = max(reach_px, float(np.abs(shift_px).max()))
+        side = 2 * (1 + int(np.ceil(min(reach_px, float(max(part_id.shape)))))) + 1
+        near = cv2.dilate((part_id == part).astype(np.uint8), np.ones((side, side), dtype=np.uint8))
+        held |= near > 0
+    return held
 
 
 def image_window(

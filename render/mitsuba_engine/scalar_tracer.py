@@ -15,7 +15,7 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from render.camera.exposure_motion import motion_blur_px, pose_polynomial
+from render.camera.exposure_motion import motion_blur_px, pose_polynomial, receiver_pixels
 from render.compositing import TracedEye, amodal_counts
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.trace_request import (
@@ -57,6 +57,10 @@ class ScalarTracer:
         for eye in EYES:
             view = _View(frame, eye)
             seen = [view.passes(scene.scene, s) for s in times]
+            view.held = view.receiver_pixels(frame, eye, seen[0])
+            for part_id, depth, normal in seen[1:]:
+                part_id[view.held], depth[view.held] = seen[0][0][view.held], seen[0][1][view.held]
+                normal[view.held] = seen[0][2][view.held]
             sunlit = [view.sunlit(scene, passes, s) for (passes, s) in zip(seen, times, strict=True)]
             alone = view.passes(scene.features, 0.0)
             plan = plan_pixels(
@@ -110,10 +114,13 @@ class _Half:
             return np.zeros((0, 4), dtype=np.float32)
         count = -(-samples // (2 * self._slices))
         total = np.zeros((len(pixel), 4), dtype=np.float32)
+        held = self._view.held.reshape(-1)[pixel]
         for index in range(self._slices):
             moment = (index + 0.5) / self._slices * 2 - 1
             seed = int(self._seeds.integers(2**31))
-            total += self._view.radiance(self._scene, (pixel, moment, count, max_depth), seed)
+            for s, rows in ((moment, np.flatnonzero(~held)), (0.0, np.flatnonzero(held))):
+                if len(rows):
+                    total[rows] += self._view.radiance(self._scene, (pixel[rows], s, count, max_depth), seed)
         return total / np.float32(self._slices)
 
 
@@ -127,10 +134,15 @@ def _untraced_eye(seen: _Passes, alone: _Passes) -> TracedEye:
 
 
 class _View:
-    """One eye as a Mitsuba sensor."""
+    """One eye as a Mitsuba sensor.
+
+    Attributes:
+        held: (H, W) pixels in which only what is there at mid-exposure is seen.
+    """
 
     def __init__(self, frame: FrameSpec, eye: Eye) -> None:
         self._camera = frame.rig.camera
+        self.held = np.zeros((self._camera.height_px, self._camera.width_px), dtype=np.bool_)
         self._pose = pose_polynomial(frame, eye)
 
     def _stage_from_eye(self, s: float) -> Array:
@@ -202,6 +214,13 @@ class _View:
                 values[v, u, 1:] = [*hit.p, *hit.n]
                 if not leaked_rays(part_id[v, u], values[v, u, 4:], direction):
                     break
+
+    def receiver_pixels(self, frame: FrameSpec, eye: Eye, passes: _Passes) -> NDArray[np.bool_]:
+        """(H, W) where the receiver's parts would be seen if they stood in the stage's axes."""
+        part_id, depth_m, _ = passes
+        v, u = np.indices(part_id.shape)
+        along = np.linalg.norm(self._camera.rays(np.stack([u, v], axis=-1)), axis=-1)
+        return receiver_pixels(frame, eye, part_id, depth_m * along.astype(np.float32))
 
     def sunlit(self, scene: DrogueScene, passes: _Passes, s: float) -> NDArray[np.bool_]:
         """(H, W) where surfaces of the drogue see the sun: one shadow ray per pixel."""

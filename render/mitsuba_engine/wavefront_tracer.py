@@ -19,7 +19,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.compiled_loops import compiled
 from geometry.stereo import EYES, Eye
-from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px
+from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px, receiver_pixels
 from render.compositing import Compositor, TracedEye, amodal_counts
 from render.mitsuba_engine.jit_arrays import jit_array, reserve_registry
 from render.mitsuba_engine.paths.body_paths import DenoisedBodyPaths
@@ -64,18 +64,22 @@ class WavefrontTracer:
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = motion_blur_px(frame)
         times = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
+        cameras = {eye: CameraRays(frame, eye) for eye in EYES}
         eyes: dict[Eye, TracedEye] = {}
         plans: dict[Eye, SamplingPlan] = {}
         narrow: dict[Eye, NDArray[np.uint8]] = {}
         for eye in EYES:
-            passes = CenterPasses(frame, eye, scene)
-            seen = [passes.part_ids(s) for s in times]
+            passes = CenterPasses(frame, cameras[eye], eye, scene)
+            middle = passes.part_ids(0.0)
+            passes.hold(receiver_pixels(frame, eye, *middle))
+            seen = [middle, *(passes.part_ids(s) for s in times[1:])]
             sunlit = [passes.sunlit(ids, s) for (ids, _), s in zip(seen, times, strict=True)]
             narrow[eye], margin_px = passes.narrow_parts(), 1 + int(np.ceil(moves_px))
             plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, margin_px, scene.uneven_parts, narrow[eye])
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        result = _by_eye(_sample_light(request, scene, eyes, (plans, narrow)), eyes, stage_s)
+        sampled = _sample_light(request, scene, [*cameras.values()], eyes, (plans, narrow))
+        result = _by_eye(sampled, eyes, stage_s)
         stage_s["paths"] = time.process_time() - started
         return result
 
@@ -97,6 +101,7 @@ def _by_eye(sampled: SampledLight, eyes: dict[Eye, TracedEye], stage_s: dict[str
 def _sample_light(
     request: TraceRequest,
     scene: DrogueScene,
+    cameras: list[CameraRays],
     eyes: dict[Eye, TracedEye],
     planned: tuple[dict[Eye, SamplingPlan], dict[Eye, NDArray[np.uint8]]],
 ) -> SampledLight:
@@ -105,6 +110,7 @@ def _sample_light(
     Args:
         request: gives frame and settings.
         scene: set up for the frame.
+        cameras: of both eyes.
         eyes: passes of both eyes.
         planned: what to trace, and what `CenterPasses.narrow_parts` gives.
     """
@@ -118,7 +124,7 @@ def _sample_light(
     open_to_sky[Part.RIBS] = denoise
     # What is known is the light on matt paint.
     open_to_sky[list(scene.shiny_parts)] = 0
-    rays, moves_px = FrameRays(frame, scene, request.ambient, open_to_sky), motion_blur_px(frame)
+    rays, moves_px = FrameRays(frame, scene, cameras, request.ambient, open_to_sky), motion_blur_px(frame)
     if denoise:
         assert frame.drogue is not None and frame.left_from_drogue is not None
         px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
@@ -198,12 +204,17 @@ CENTER = (0.5, 0.5)
 class CenterPasses:
     """Part id, depth and normal by the rays through the pixel centres of one eye."""
 
-    def __init__(self, frame: FrameSpec, eye: Eye, scene: DrogueScene) -> None:
-        self._rays = CameraRays(frame, eye)
-        self._scene = scene
+    def __init__(self, frame: FrameSpec, rays: CameraRays, eye: Eye, scene: DrogueScene) -> None:
+        self._rays, self._scene = rays, scene
         camera = frame.rig.camera
         self._shape = (camera.height_px, camera.width_px)
         self._rig, self._eye = frame.rig, eye
+        self._held = np.zeros(self._shape, dtype=np.bool_)
+
+    def hold(self, held: NDArray[np.bool_]) -> None:
+        """See in (H, W) pixels only what is there at mid-exposure."""
+        self._held = held
+        self._rays.hold(held)
 
     def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
         return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
@@ -213,6 +224,8 @@ class CenterPasses:
         ids, distance_m = np.zeros(self._shape, dtype=np.uint8), np.full(self._shape, np.inf, dtype=np.float32)
         # Most rays miss; those through windows without objects need not be traced.
         pixel = self.pixels_of(self._scene.object_corners_m, s)
+        if self._held.any():
+            pixel = np.union1d(pixel, np.flatnonzero(self._held))
         if len(pixel):
             rays = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
             ids.reshape(-1)[pixel], distance_m.reshape(-1)[pixel] = self._hits(self._scene.scene, rays)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +45,9 @@ class CameraRays:
         self._pose = pose_polynomial(frame, eye)
         self.pose_at_middle = self._pose[0]
         self.moves = bool(np.abs(self._pose[1:]).max() > 0)
+        # Of each pixel, where anything moves: 0 where what flies with the camera is seen, else 1.
+        self._moving: Any = None
+        self.hold(np.zeros((self.camera.height_px, self.camera.width_px), dtype=np.bool_))
         # Python numbers would become part of the compiled kernel, so that every frame would compile its own.
         self._opaque_pose = [
             [[dr.opaque(mi.Float, float(value)) for value in row] for row in coefficient] for coefficient in self._pose
@@ -54,6 +57,11 @@ class CameraRays:
         """Pose at mid-exposure (s = 0) or at one of its ends (-1, 1), where the polynomial is exact."""
         matrix = np.vstack([self._pose[0] + s * (self._pose[1] + s * self._pose[2]), [0.0, 0.0, 0.0, 1.0]])
         return RigidTransform.from_matrix(matrix)
+
+    def hold(self, held: NDArray[np.bool_]) -> None:
+        """See in (H, W) pixels only what is there at mid-exposure."""
+        if self.moves:
+            self._moving = jit_array(mi.Float, np.where(held, np.float32(0.0), np.float32(1.0)).ravel())
 
     def rays(self, pixel: Any, place: Any, moment: Any) -> Any:
         """Rays through pixels.
@@ -72,7 +80,7 @@ class CameraRays:
         else:
             slope_x, slope_y = (self._between_corners(slopes, pixel + row, place) for slopes in self._slopes)
         local = dr.normalize(mi.Vector3f(slope_x, slope_y, mi.Float(1.0)))
-        pose = self._pose_at(2.0 * moment - 1.0)
+        pose = self._pose_at(2.0 * moment - 1.0, pixel)
         direction = mi.Vector3f(*[pose[i][0] * local.x + pose[i][1] * local.y + pose[i][2] * local.z for i in range(3)])
         return mi.Ray3f(mi.Point3f(*[pose[i][3] for i in range(3)]), dr.normalize(direction))
 
@@ -82,10 +90,11 @@ class CameraRays:
         first, second, third, fourth = (dr.gather(mi.Float, slopes, at) for at in (low, low + 1, high, high + 1))
         return dr.lerp(dr.lerp(first, second, place.x), dr.lerp(third, fourth, place.x), place.y)
 
-    def _pose_at(self, s: Any) -> list[list[Any]]:
+    def _pose_at(self, s: Any, pixel: Any) -> list[list[Any]]:
         c = self._opaque_pose
         if not self.moves:
             return c[0]
+        s = s * dr.gather(mi.Float, self._moving, pixel)
         return [[c[0][i][j] + s * (c[1][i][j] + s * c[2][i][j]) for j in range(4)] for i in range(3)]
 
 
@@ -131,13 +140,19 @@ class FrameRays:
     """
 
     def __init__(
-        self, frame: FrameSpec, scene: DrogueScene, ambient: EnvironmentRadiance, open_to_sky: NDArray[np.uint8]
+        self,
+        frame: FrameSpec,
+        scene: DrogueScene,
+        cameras: Sequence[CameraRays],
+        ambient: EnvironmentRadiance,
+        open_to_sky: NDArray[np.uint8],
     ) -> None:
         """Set up the rays of a frame.
 
         Args:
             frame: cameras, exposure and seed.
             scene: set up for the frame.
+            cameras: of both eyes.
             ambient: radiance of its environment.
             open_to_sky: (256,) 1 for parts whose light from the whole sky is taken as known; see `SceneLights`.
         """
@@ -145,7 +160,7 @@ class FrameRays:
         self.width_px = frame.rig.camera.width_px
         self.size = self.width_px * frame.rig.camera.height_px
         self.focal_px = frame.rig.camera.fx_px
-        self._cameras = [CameraRays(frame, eye) for eye in EYES]
+        self._cameras = cameras
         self._seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         self.has_map = np.zeros(256, dtype=np.bool_)
         self.has_map[[surface.part_id for surface in scene.surfaces if surface.uv is not None]] = True

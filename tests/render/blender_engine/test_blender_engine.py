@@ -31,6 +31,7 @@ from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
+from tests.support.rods import receiver_rod_frame, rod_coverage
 
 if TYPE_CHECKING:
     from render.blender_engine.blender_engine import BlenderEngine
@@ -234,6 +235,16 @@ def test_moving_drogue_is_blurred_around_its_middle(blender: BlenderEngine) -> N
     width = [np.count_nonzero(image[row] > 0.02) for image in (sharp, blurred)]
     # Two markers lie on the row; the streaks' ends are spread over a pixel each.
     assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)
+
+
+def test_the_receiver_s_parts_stay_sharp_while_the_drogue_moves(blender: BlenderEngine) -> None:
+    frame = receiver_rod_frame()
+    expected = rod_coverage(frame)
+    seen = blender.render(frame, RenderSettings(surround_samples_per_px=64)).left
+    error = (seen.coverage - expected)[80:, 20:140]
+    # 64 random rays leave 0.06 where half of a pixel is covered.
+    assert np.sqrt(np.mean(error[expected[80:, 20:140] > 0] ** 2)) < 0.08
+    assert np.abs(error).max() < 0.35
 
 
 def test_frames_without_a_drogue(blender: BlenderEngine) -> None:

@@ -48,13 +48,14 @@ BYSTANDERS = {"probe": True, "obstacle_frame_fraction": 1, "distractor_frame_fra
 def test_nothing_is_seen_where_no_ray_is_sent(
     scene_of: Callable[[FrameSpec], Any], changes: RecipeTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from render.mitsuba_engine.paths.rays import CameraRays
     from render.mitsuba_engine.wavefront_tracer import CenterPasses
 
     recipe = build_recipe(BASE, **changes)
     for frame in (sample_frame(recipe, index) for index in range(recipe.frames.count)):
         scene = scene_of(frame)
         for eye in EYES:
-            passes, everywhere = (CenterPasses(frame, eye, scene) for _ in range(2))
+            passes, everywhere = (CenterPasses(frame, CameraRays(frame, eye), eye, scene) for _ in range(2))
             size = frame.rig.camera.width_px * frame.rig.camera.height_px
             monkeypatch.setattr(everywhere, "pixels_of", lambda *_, size=size: np.arange(size))
             for s in (-1.0, 0.0, 1.0):

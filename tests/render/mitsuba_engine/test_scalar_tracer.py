@@ -15,6 +15,7 @@ from geometry.stereo import EYES
 from render.compositing import inside_one_part
 from render.engine import StereoRadiance
 from tests.support.recipe_builder import recipe_text, stations
+from tests.support.rods import receiver_rod_frame, rod_coverage
 
 pytestmark = pytest.mark.mitsuba
 
@@ -152,6 +153,30 @@ def test_scenes_that_share_shapes_do_not_change_each_other(tmp_path: Path, pytes
     for one, other in pickle.loads((tmp_path / "seen.pickle").read_bytes()):
         np.testing.assert_array_equal(one.part_id, other.part_id)
         np.testing.assert_array_equal(one.radiance_cd_m2, other.radiance_cd_m2)
+
+
+ROD = """
+import pickle, sys
+sys.path.insert(0, sys.argv[1])
+from datasets_manifest.recipe.recipe import RenderSettings
+from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
+from tests.support.rods import receiver_rod_frame
+engine = MitsubaEngine()
+assert "scalar" in engine.version
+seen = engine.render(receiver_rod_frame(), RenderSettings(surround_samples_per_px=64, edge_samples_per_px=64)).left
+pickle.dump(seen.coverage, open(sys.argv[2], "wb"))
+"""
+
+
+def test_the_receiver_s_parts_stay_sharp_while_the_drogue_moves(tmp_path: Path, pytestconfig: pytest.Config) -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed")
+    command = [sys.executable, "-c", ROD, str(pytestconfig.rootpath), str(tmp_path / "seen.pickle")]
+    subprocess.run(command, check=True, env={**os.environ, "DRJIT_LIBLLVM_PATH": "/nonexistent/libLLVM.so"})
+    expected = rod_coverage(receiver_rod_frame())[80:, 20:140]
+    error = pickle.loads((tmp_path / "seen.pickle").read_bytes())[80:, 20:140] - expected
+    # 64 random rays leave 0.06 where half of a pixel is covered.
+    assert np.sqrt(np.mean(error[expected > 0] ** 2)) < 0.08
+    assert np.abs(error).max() < 0.35
 
 
 HIDDEN_LAMPS = """

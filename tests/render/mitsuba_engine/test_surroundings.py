@@ -15,51 +15,16 @@ from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.painted_mesh import PaintedMesh
-from drogue_models.parts import Part
+from drogue_models.parts import Part, drogue_part_ids
 from geometry.se3 import RigidTransform
 from render.engine import EyeRadiance, RenderEngine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import RIG_160_PX, build_recipe, stations
+from tests.support.rods import receiver_rod_frame, rod_coverage, rod_frame
 
 pytestmark = pytest.mark.mitsuba
 # Along the rods, away from their ends. [px]
 _COLUMNS = np.s_[:, 20:140]
-
-
-def rod_frame(radius_m: float) -> FrameSpec:
-    """A rod of 5 m, 10 m away, that nearly follows the rows of the left image, and nothing else."""
-    recipe = build_recipe(
-        name="rod",
-        rig=RIG_160_PX,
-        frames={"count": 1, "empty_fraction": 1.0},
-        distance=stations(5.0),
-        environment={"ground": "sea", "clouds": {"scene_fraction": 0.0}},
-    )
-    along = np.array([1.0, 0.031, 0.0]) / np.hypot(1.0, 0.031)
-    down = np.array([-along[1], along[0], 0.0])
-    pose = RigidTransform(np.column_stack([down, np.cross(along, down), along]), np.array([0.1, 0.13, 10.0]))
-    rod = Obstacle(
-        kind="obstacle",
-        shape=ObstacleShape(form="bar", radius_m=radius_m, length_m=5.6),
-        left_from_object=pose,
-        reflectance_rgb=(0.3, 0.3, 0.3),
-    )
-    return sample_frame(recipe, 0).model_copy(update={"bystanders": (rod,), "left_from_tanker": None})
-
-
-def rod_coverage(frame: FrameSpec, side: int = 12) -> np.ndarray:
-    """(H, W) share of each pixel that an endless rod covers: rays that pass its axis within the radius."""
-    (rod,), camera = frame.bystanders, frame.rig.camera
-    axis, middle = rod.left_from_object.rotation[:, 2], rod.left_from_object.translation_m
-    fine = (np.arange(side) + 0.5) / side - 0.5
-    v, u = np.meshgrid(
-        (np.arange(camera.height_px)[:, None] + fine).ravel(),
-        (np.arange(camera.width_px)[:, None] + fine).ravel(),
-        indexing="ij",
-    )
-    across = np.cross(axis, camera.rays(np.stack([u, v], axis=-1)))
-    hit = np.abs(across @ middle) < rod.shape.radius_m * np.linalg.norm(across, axis=-1)
-    return hit.reshape(camera.height_px, side, camera.width_px, side).mean(axis=(1, 3))
 
 
 def test_edges_cover_what_they_should(engine: RenderEngine) -> None:
@@ -98,6 +63,23 @@ def world_frame(index: int) -> FrameSpec:
     # These frames were found by streams of the seed alone.
     frames = recipe.frames.model_copy(update={"stream": ""})
     return sample_frame(recipe.model_copy(update={"frames": frames}), index)
+
+
+def test_the_receiver_s_parts_stay_sharp_while_the_drogue_moves(engine: RenderEngine) -> None:
+    """They fly with the cameras: only what moves against these is blurred."""
+    frame = receiver_rod_frame()
+    expected = rod_coverage(frame)[_COLUMNS]
+    moving = engine.render(frame, RenderSettings()).left
+    still = engine.render(frame.model_copy(update={"drogue_twist_per_s": np.zeros(6)}), RenderSettings()).left
+    near = expected > 0
+    for seen in (moving, still):
+        error = (seen.coverage[_COLUMNS] - expected)[near]
+        assert np.sqrt(np.mean(error**2)) < 0.08
+        # Nothing of it is seen anywhere else.
+        assert seen.coverage[_COLUMNS][75:][expected[75:] == 0].max() < 0.1
+    assert np.array_equal(moving.part_id, still.part_id)
+    drogue = np.isin(still.part_id, drogue_part_ids(frame.drogue.marker_count))
+    assert np.abs(moving.coverage - still.coverage)[drogue].max() > 0.2
 
 
 def test_no_holes_on_the_pod_beside_a_moving_drogue(engine: RenderEngine) -> None:
