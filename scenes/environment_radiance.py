@@ -19,6 +19,7 @@ from scenes.atmosphere.scattering_sky import ScatteringAir, ScatteringSky
 from scenes.clouds.cloud_layers import CloudLayerRenderer
 from scenes.ground.ground_radiance import Ground, highest_land_sine
 from scenes.ground.sea import GroundLight
+from scenes.ground.terrain import Seen
 from scenes.ground_view import EARTH_M, pixel_angle_rad
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.equirectangular_sky import load_map
@@ -27,6 +28,8 @@ from scenes.sky.photometry import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
 _LIGHT_MAP_HEIGHT_PX = 128
 # Pictures of so many rays do not march all of them through clouds.
 _MANY_RAYS = 60_000
+# Rays across the disc of sun or moon that tell how much of it is behind land.
+_DISC_RAYS = 12
 
 
 class EnvironmentRadiance:
@@ -59,6 +62,7 @@ class EnvironmentRadiance:
         own = {"ground": self.ground.moved_to(environment), "light_map": self.light_map}
         moved = copy(self)
         moved.environment, moved.air = environment, self.air.moved_to(environment)
+        vars(moved).pop("beam_illuminance_lux", None)
         vars(moved).update(own)
         return moved
 
@@ -123,18 +127,51 @@ class EnvironmentRadiance:
         return total
 
     def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
-        """Add the discs of sun and moon behind cloud and mist, in place, to (H, W, 3) radiance along directions."""
-        self.sky.add_discs(radiance, directions, self.air.beam_share)
+        """Add sun and moon behind land, cloud and mist, in place, to (H, W, 3) radiance along directions."""
+        self.sky.add_discs(radiance, directions, self.air.beam_share * self._share_above_ground(directions))
+
+    def _share_above_ground(self, directions: NDArray[np.float32]) -> float | NDArray[np.float64]:
+        """(H, W) share of each pixel that ground leaves open, or 1 if no disc of sun or moon is near ground."""
+        ground_below = self._ground_below(directions)
+        if self.sky.lowest_disc_sine >= ground_below:
+            return 1.0
+        # The rows of `_layered`, so that disc and land share their outline.
+        rows = _rows_with(directions[..., 2] < ground_below)
+        if not self.sky.shows_disc(directions[rows]):
+            return 1.0
+        shares = np.ones(directions.shape[:2])
+        shares[rows] -= self._ground_share(directions[rows])[1]
+        return shares
 
     @property
     def beam_direction(self) -> NDArray[np.float64]:
         """(3,) unit vector in world axes towards the light that casts shadows: the sun, or at night the moon."""
         return self.sky.beam.direction
 
-    @property
+    @cached_property
     def beam_illuminance_lux(self) -> NDArray[np.float64]:
-        """(3,) illuminance of a plane at the camera that faces the beam, through air, cloud and mist. [lux]"""
-        return self.air.beam_illuminance_lux
+        """(3,) illuminance at the camera of a plane that faces the beam, past land, air, cloud and mist. [lux]"""
+        result: NDArray[np.float64] = self.air.beam_illuminance_lux * self._beam_above_land()
+        return result
+
+    def _beam_above_land(self) -> float:
+        """Share of the disc of sun or moon that hills, trees and houses leave open."""
+        to_beam = self.beam_direction
+        is_high = to_beam[2] - SUN_RADIUS_RAD > highest_land_sine(self.environment)
+        if is_high or self.air.beam_illuminance_lux.max() <= 0.0:
+            return 1.0
+        place = (np.arange(_DISC_RAYS) + 0.5) * (2.0 / _DISC_RAYS) - 1.0
+        across, up = np.meshgrid(place, -place)
+        right = np.cross(to_beam, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        offset = across[..., None] * right + up[..., None] * np.cross(right, to_beam)
+        rays = to_beam + SUN_RADIUS_RAD * offset
+        # Refraction lifts what has set; how much of the disc has set on a level horizon, the beam knows.
+        lowest = (self.air.round_horizon_sine or 0.0) + SUN_RADIUS_RAD / _DISC_RAYS
+        rays[..., 2] = np.maximum(rays[..., 2], lowest)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        met = self.ground.seen(rays.astype(np.float32))
+        return 1.0 if met is None else 1.0 - float(met.share[np.hypot(across, up) < 1.0].mean(dtype=np.float64))
 
     @property
     def extinction_per_m(self) -> float:
@@ -184,12 +221,9 @@ class EnvironmentRadiance:
         """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` is its visible share."""
         if directions.size == 0:
             return
-        met = self.ground.seen(directions)
+        met, share = self._ground_share(directions)
         level = None if met is None else self._level_rays(directions, met.distance_m)
         seen = self.air.before_ground(self.ground.radiance(directions, uncovered, met), directions, horizon, level)
-        share = self.air.horizon_share(directions, pixel_angle_rad(directions))
-        if met is not None:
-            share = np.maximum(share, met.share)
         whole = (share == 1.0).all(axis=1)
         # Whole rows at once where possible: a masked copy takes as long as everything before.
         total[whole] = seen[whole]
@@ -197,6 +231,12 @@ class EnvironmentRadiance:
         mixed = (share > 0.0) & (share < 1.0)
         if mixed.any():
             total[mixed] += share[mixed][:, None] * (seen[mixed] - total[mixed])
+
+    def _ground_share(self, directions: NDArray[np.float32]) -> tuple[Seen | None, NDArray[np.float32]]:
+        """Where (H, W, 3) directions meet hills, as `Ground.seen`, and (H, W) share of the pixels that is ground."""
+        met = self.ground.seen(directions)
+        share = self.air.horizon_share(directions, pixel_angle_rad(directions))
+        return met, share if met is None else np.maximum(share, met.share)
 
     def _level_rays(self, directions: NDArray[np.float32], distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W, 3) rays in whose directions level ground is (H, W) as far away; they have as much air before it."""

@@ -140,30 +140,45 @@ class ClearSky:
         total += night_radiance(directions)
         return total
 
-    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32], through: float) -> None:
+    @property
+    def luminaries(self) -> tuple[Luminary, ...]:
+        """Sun, and moon if there is one."""
+        return (self.sun,) if self.moon is None else (self.sun, self.moon)
+
+    @property
+    def lowest_disc_sine(self) -> float:
+        """Sine of the elevation that no disc of sun or moon is wholly below."""
+        return min(float(luminary.direction[2]) for luminary in self.luminaries) - float(SUN_RADIUS_RAD)
+
+    def shows_disc(self, directions: NDArray[np.float32]) -> bool:
+        """Whether any of (..., 3) unit directions meets the disc of sun or moon."""
+        return any(_meets_disc(luminary, directions).any() for luminary in self.luminaries)
+
+    def add_discs(
+        self, radiance: Radiance, directions: NDArray[np.float32], through: float | NDArray[np.floating[Any]]
+    ) -> None:
         """Add the discs of sun and moon, in place.
 
         Args:
             radiance: (..., 3) along `directions`. [cd/m2]
             directions: (..., 3) unit vectors in world axes.
-            through: share of the beam that cloud and mist transmit.
+            through: share of the beam that is not stopped on its way; a number, or (...).
         """
-        for luminary in (self.sun, self.moon):
-            if luminary is None:
-                continue
-            cosine = np.einsum("...i,i->...", directions, luminary.direction.astype(np.float32))
-            disc = (cosine > np.cos(SUN_RADIUS_RAD)) & self._visible(directions)
+        through = np.broadcast_to(through, directions.shape[:-1])
+        for luminary in self.luminaries:
+            disc = _meets_disc(luminary, directions) & self._visible(directions)
             if not disc.any():
                 continue
             lit, area_sr = np.ones(int(disc.sum()), dtype=bool), SUN_SOLID_ANGLE_SR
             if luminary is self.moon and self._moon is not None:
                 lit = self._lit_moon(directions[disc])
                 area_sr *= 0.5 * (1.0 + np.cos(np.radians(self._moon.phase_angle_deg)))
-            share = self._disc_lux(luminary, directions[disc]) * through / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
+            lux = self._disc_lux(luminary, directions[disc]) * through[disc][:, None]
+            share = lux / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
             radiance[disc] += lit[:, None] * share.astype(np.float32)
 
     def _visible(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(...) which directions no ground hides."""
+        """(...) which directions are above the level horizon."""
         above: NDArray[np.bool_] = directions[..., 2] > 0
         return above
 
@@ -182,3 +197,10 @@ class ClearSky:
         along = np.einsum("ni,i->n", offset, away)
         across = np.einsum("ni,i->n", offset, np.cross(to_moon, away))
         return lit_side_of_moon(self._moon, across.astype(np.float32), along.astype(np.float32))
+
+
+def _meets_disc(luminary: Luminary, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(...) which (..., 3) unit directions meet the disc."""
+    cosine = np.einsum("...i,i->...", directions, luminary.direction.astype(np.float32))
+    meets: NDArray[np.bool_] = cosine > np.cos(SUN_RADIUS_RAD)
+    return meets
