@@ -29,7 +29,7 @@ class LayeredAir:
     """Light between the cloud layers and mist of one environment, under its clear sky."""
 
     def __init__(self, environment: Environment, sky: ClearSky) -> None:
-        self._environment = environment
+        self._environment = _with_mist_over_ground(environment)
         self._sky = sky
 
     def moved_to(self, environment: Environment) -> LayeredAir:
@@ -39,7 +39,7 @@ class LayeredAir:
             environment: the same environment with another `camera_offset_m`.
         """
         moved = copy(self)
-        moved._environment = environment
+        moved._environment = _with_mist_over_ground(environment)
         for own in ("beam_share", "beam_illuminance_lux"):
             vars(moved).pop(own, None)
         return moved
@@ -234,6 +234,14 @@ class LayeredAir:
             path_m = reach_m / np.maximum(np.abs(directions[..., 2]), np.float32(1e-6))
             depth = np.float32(mist.extinction_per_m) * path_m
         radiance += (1.0 - np.exp(-depth))[..., None] * (light - radiance)
+
+
+def _with_mist_over_ground(environment: Environment) -> Environment:
+    """The environment with mist that ends at the ground, where its own reaches below it."""
+    mist = environment.mist
+    if mist is None or mist.below_m <= environment.altitude_m:
+        return environment
+    return environment.model_copy(update={"mist": mist.model_copy(update={"below_m": environment.altitude_m})})
 
 
 def transmitted_share(layers: tuple[CloudLayer, ...]) -> float:

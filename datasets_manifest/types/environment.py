@@ -79,7 +79,7 @@ class Mist(FrozenModel):
 
     Attributes:
         visibility_m: meteorological range in it (2 % contrast), of patchy mist around the camera. [m]
-        above_m, below_m: extent above and below the camera. [m]
+        above_m, below_m: extent above and below the camera; the ground ends it. [m]
         patchiness: 0 for the same density everywhere, 1 for patches and layers between which it is nearly clear.
         texture_seed: seed of the patches.
     """
