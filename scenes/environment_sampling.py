@@ -12,7 +12,15 @@ from datasets_manifest.recipe.environment_ranges import (
     MistRanges,
     MoonRanges,
 )
-from datasets_manifest.types.environment import CloudLayer, Environment, EnvironmentMap, GroundKind, Mist, Moon
+from datasets_manifest.types.environment import (
+    LEAST_THICKNESS_M,
+    CloudLayer,
+    Environment,
+    EnvironmentMap,
+    GroundKind,
+    Mist,
+    Moon,
+)
 from datasets_manifest.types.field_types import Range
 from drogue_models.frozen_model import ReflectanceRgb
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE
@@ -52,13 +60,14 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
         sample_cloud(stream, frame_generator(seed, scene_id, f"cloud shape {index}"), clouds)
         for index, (stream, clouds) in enumerate(zip(layer_streams, ranges.clouds, strict=False))
     ]
+    over_ground = [_over_ground(layer, sky["altitude_m"]) for layer in layers if layer is not None]
     environment = Environment(
         **sky,
         ground=ground,
         ground_reflectance_rgb=_sample_reflectance(ground_rng, ground),
         ground_texture_seed=ground_texture_seed,
         wind_speed_m_s=sample_uniform(ground_rng, ranges.wind_speed_m_s),
-        clouds=tuple(layer for layer in layers if layer is not None),
+        clouds=tuple(layer for layer in over_ground if layer is not None),
         mist=sample_mist(
             frame_generator(seed, scene_id, "mist"), frame_generator(seed, scene_id, "mist patches"), ranges.mist
         ),
@@ -108,6 +117,14 @@ def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, cloud
         heading_deg=sample_uniform(shape_rng, clouds.heading_deg),
     )
     return layer if rng.random() < clouds.scene_fraction else None
+
+
+def _over_ground(layer: CloudLayer, altitude_m: float) -> CloudLayer | None:
+    """The layer, thinner where it would reach into the ground, or None where there is no room for it."""
+    room_m = altitude_m + layer.height_above_camera_m
+    if layer.is_above or layer.thickness_m <= room_m:
+        return layer
+    return None if room_m < LEAST_THICKNESS_M else layer.model_copy(update={"thickness_m": room_m})
 
 
 def sample_mist(rng: np.random.Generator, patch_rng: np.random.Generator, ranges: MistRanges) -> Mist | None:

@@ -6,7 +6,7 @@ from typing import Self
 
 from pydantic import Field, field_validator, model_validator
 
-from datasets_manifest.types.environment import CloudKind, EnvironmentMapFile, GroundKind, SkyModel
+from datasets_manifest.types.environment import LEAST_THICKNESS_M, CloudKind, EnvironmentMapFile, GroundKind, SkyModel
 from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
 
@@ -39,7 +39,7 @@ class Clouds(FrozenModel):
         if self.kind == "rain" and height.low < 0:
             raise ValueError("height_above_camera_m: rain must end above the camera")
         self.cover_fraction.within(0, 1, "cover_fraction")
-        self.thickness_m.within(10, 5000, "thickness_m")
+        self.thickness_m.within(LEAST_THICKNESS_M, 5000, "thickness_m")
         self.feature_size_m.within(10, 1e5, "feature_size_m")
         self.optical_depth.within(0.01, 200, "optical_depth")
         self.heading_deg.within(-360, 360, "heading_deg")
@@ -150,4 +150,11 @@ class EnvironmentRanges(FrozenModel):
         self.wind_speed_m_s.within(0, 40, "wind_speed_m_s")
         if self.map is not None and self.sky_model != "daylight":
             raise ValueError("sky_model: a map replaces the sky; leave out one of the two")
+        for layer in self.clouds:
+            highest_m = layer.height_above_camera_m.high
+            if layer.scene_fraction > 0 and self.altitude_m.high + highest_m < LEAST_THICKNESS_M:
+                raise ValueError(
+                    f"clouds: height_above_camera_m up to {highest_m:g} is always in the ground with altitude_m up to "
+                    f"{self.altitude_m.high:g}"
+                )
         return self

@@ -24,6 +24,9 @@ Turbulence = Literal["none", "light", "moderate", "severe"]
 MIN_AIRSPEED_M_S = 5.0
 """Lowest airspeed with turbulence: the frozen gust field moves past the aircraft at its airspeed. [m/s]"""
 
+LEAST_THICKNESS_M = 10.0
+"""Thickness of the thinnest layer of cloud. [m]"""
+
 MAP_SUFFIXES = (".exr", ".hdr")
 
 # Six contrails some 500 m wide over a few tens of kilometres.
@@ -48,7 +51,7 @@ class CloudLayer(FrozenModel):
 
     kind: CloudKind = "cumulus"
     height_above_camera_m: float = Field(ge=-15000, le=15000)
-    thickness_m: float = Field(default=600.0, ge=10, le=5000)
+    thickness_m: float = Field(default=600.0, ge=LEAST_THICKNESS_M, le=5000)
     cover_fraction: float = Field(ge=0, le=1)
     feature_size_m: float = Field(gt=0, le=1e5)
     optical_depth: float = Field(gt=0, le=200)
