@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer, Environment
-from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
+from scenes.clouds.cloud_layers import (
+    BACK_SCATTER,
+    CloudLight,
+    diffuse_transmission,
+    direct_transmission,
+    opacity_towards,
+)
 from scenes.clouds.thin_layers import mist_depth
 from scenes.ground_view import FARTHEST_M
 from scenes.sky.clear_sky import ClearSky
@@ -251,5 +257,4 @@ def transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
 
 def direct_share(layers: tuple[CloudLayer, ...]) -> float:
     """Mean share of light that the layers transmit directly."""
-    shares = [1.0 - layer.shading_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
-    return float(np.prod(shares)) if shares else 1.0
+    return float(np.prod([direct_transmission(layer) for layer in layers])) if layers else 1.0

@@ -42,7 +42,8 @@ class CloudLayer(FrozenModel):
             `height_above_camera_m` or evaporate before.
         height_above_camera_m: of the side that faces the camera: the base above it, or, negative, the top below. [m]
         thickness_m: from base to the highest tops; cirrus and contrails ignore it. [m]
-        cover_fraction: share of the layer's plan that is cloud; of contrails it sets the number, one to six.
+        cover_fraction: share of the layer's plan that is cloud, of cirrus with more than a tenth of `optical_depth`; of
+            contrails it sets the number, one to six.
         feature_size_m: size of the largest clouds. [m]
         optical_depth: in the thick parts, vertically.
         heading_deg: direction of streaks and trails, and against which rain leans, from east towards north. [deg]

@@ -23,7 +23,7 @@ from scenes.clouds.ray_march import (
     march_rays,
     starts_of,
 )
-from scenes.clouds.thin_layers import shaft_depth, thin_depth
+from scenes.clouds.thin_layers import ice_sample_depths, shaft_depth, thin_depth
 from scenes.ground_view import pixel_angle_rad
 from scenes.sky.photometry import Radiance, henyey_greenstein
 
@@ -96,7 +96,16 @@ class CloudLayerView:
 
 def diffuse_transmission(layer: CloudLayer) -> float:
     """Mean share of light that the layer transmits, direct or scattered."""
+    if layer.kind == "cirrus":
+        return float(np.mean(1.0 / (1.0 + BACK_SCATTER * ice_sample_depths(layer)), dtype=np.float64))
     return 1.0 - layer.shading_fraction * (1.0 - 1.0 / (1.0 + BACK_SCATTER * layer.optical_depth))
+
+
+def direct_transmission(layer: CloudLayer) -> float:
+    """Mean share of light that the layer transmits directly."""
+    if layer.kind == "cirrus":
+        return float(np.mean(np.exp(-ice_sample_depths(layer)), dtype=np.float64))
+    return 1.0 - layer.shading_fraction * (1.0 - float(np.exp(-layer.optical_depth)))
 
 
 class LayerGeometry:

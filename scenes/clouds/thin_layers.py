@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.special import ndtri
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import CloudLayer, Mist
 from geometry.compiled_loops import compiled
-from scenes.clouds.cloud_textures import body_tile, ice_tiles
+from scenes.clouds.cloud_textures import BLOBS_PER_TILE, body_tile, ice_tiles
 from scenes.clouds.ray_march import tile_at
 
 _Field = NDArray[np.float32]
@@ -20,7 +21,11 @@ _RAIN_STEPS, _RAIN_REACH_M, _RAIN_LEAN = 24, 3e4, 0.35
 # Steps through mist, up to an optical depth behind which nothing is seen; patches are so many visibilities large.
 _MIST_STEPS, _MIST_DEPTH, _PATCH_PER_VISIBILITY, _LEAST_PATCH_M = 10, 6.0, 0.5, 60.0
 _PATCH_SHADE = 0.3
-
+# Cirrus covers a place with more than this of the layer's optical depth; places along a side that tell its cover.
+_ICE_EDGE, _ICE_SAMPLES = 0.1, 128
+_ICE_GAPS = 0.005
+# How fast ice thins out, and its depth over its amount.
+_ICE_SOFT, _ICE_DEPTH = 1.5, 0.3
 
 _FRESH_M = 60.0
 # Contrails: at most so many, the widths that they spread to with age, and how far they bend aside. [m]
@@ -32,38 +37,70 @@ _MOST_SLANT = 12.0
 
 
 @compiled
-def _ice_depth(
-    tiles: NDArray[np.float32],
-    body: NDArray[np.float32],
-    places: NDArray[np.float64],
-    threshold: float,
-    depth: NDArray[np.float32],
+def _ice_amounts(
+    tiles: NDArray[np.float32], body: NDArray[np.float32], places: NDArray[np.float64], found: NDArray[np.float32]
 ) -> None:
-    """Fill in depth over its usual amount.
+    """Fill in the amount of ice with patches everywhere, and the logarithm of how its fibres differ from it.
 
     Args:
         tiles: as `ice_tiles` gives them.
         body: texture of the patches.
         places: (N, 3) along and across the wind, and width of the ray, in sizes of the largest patches.
-        threshold: over which there is a patch.
-        depth: (N,) filled in.
+        found: (N, 2) filled in.
     """
     for index in range(places.shape[0]):
         u, v, width = places[index, 0], places[index, 1], places[index, 2]
         bend = tile_at(tiles[2], 28.0 * u, 28.0 * v)
         other = tile_at(tiles[2], 28.0 * v + 211.0, 28.0 * u + 97.0)
         pu, pv = u + 0.06 * bend, v + 0.08 * other
-        patch = tile_at(body, 55.0 * pu, 70.0 * pv) - threshold
+        patch = tile_at(body, 55.0 * pu, 70.0 * pv)
         wide = tile_at(tiles[0], 90.0 * pu, 160.0 * pv)
         fine = tile_at(tiles[0], 260.0 * pu + 60.0, 500.0 * pv + 5.0 * other)
         # Faint where its texels are finer than the rays.
-        seen = min(1.0 / (1400.0 * width), 1.0)
+        seen = min(1.0 / (1400.0 * width), 1.0) if width > 0.0 else 1.0
         finest = seen * tile_at(tiles[0], 700.0 * pu, 1400.0 * pv + 20.0 * other)
         trail = tile_at(tiles[1], 58.0 * pu, 80.0 * pv)
-        # Smooth from nothing to much: ice thins out over a long way.
-        sum_of_all = 0.5 + 0.65 * patch + 0.5 * wide + 0.35 * fine + 0.5 * (trail - 1.0)
-        amount = np.log1p(np.exp(1.5 * sum_of_all)) / 1.5
-        depth[index] = 0.3 * amount * np.exp(0.12 * wide + 0.18 * fine + 0.18 * finest)
+        found[index, 0] = 0.5 + 0.65 * patch + 0.5 * wide + 0.35 * fine + 0.5 * (trail - 1.0)
+        found[index, 1] = 0.12 * wide + 0.18 * fine + 0.18 * finest
+
+
+def _ice_at(places: NDArray[np.float64], texture_seed: int) -> _Field:
+    found = np.empty((len(places), 2), dtype=np.float32)
+    _ice_amounts(ice_tiles(texture_seed), body_tile(texture_seed, _BODY_SLOPE), places, found)
+    return found
+
+
+@lru_cache(maxsize=16)
+def _ice_samples(texture_seed: int) -> _Field:
+    """(N, 2) results of `_ice_amounts` at places evenly spread over eight largest patches along and across."""
+    side = (np.arange(_ICE_SAMPLES) + 0.5) * (BLOBS_PER_TILE / _ICE_SAMPLES)
+    u, v = (axis.ravel() for axis in np.meshgrid(side, side))
+    return _ice_at(np.column_stack([u, v, np.zeros_like(u)]), texture_seed)
+
+
+def _ice_threshold(layer: CloudLayer) -> np.float32:
+    """What must be taken off the amount of ice so that it covers its share of the plan."""
+    if layer.cover_fraction == 0.0:
+        return np.float32(np.inf)
+    amount, fibres = _ice_samples(layer.texture_seed).T
+    # Where `_ice_depth` is `_ICE_EDGE`.
+    edge = np.log(np.expm1(_ICE_SOFT * _ICE_EDGE / _ICE_DEPTH * np.exp(-fibres))) / _ICE_SOFT
+    # The thinnest of all places does not decide how thick an overcast is.
+    return np.float32(np.quantile(amount - edge, max(1.0 - layer.cover_fraction, _ICE_GAPS)))
+
+
+def _ice_depth(layer: CloudLayer, found: _Field) -> _Field:
+    """(N,) vertical optical depth, over the layer's, of (N, 2) results of `_ice_amounts`."""
+    amount, fibres = found.T
+    # Smooth from nothing to much: ice thins out over a long way.
+    smooth = np.log1p(np.exp(np.float32(_ICE_SOFT) * (amount - _ice_threshold(layer)))) * np.float32(1 / _ICE_SOFT)
+    depth: _Field = np.float32(_ICE_DEPTH) * smooth * np.exp(fibres)
+    return depth
+
+
+def ice_sample_depths(layer: CloudLayer) -> _Field:
+    """(N,) vertical optical depths of cirrus at places evenly spread over its plan."""
+    return np.float32(layer.optical_depth) * _ice_depth(layer, _ice_samples(layer.texture_seed))
 
 
 @compiled
@@ -135,19 +172,17 @@ def thin_depth(
     east_m = directions[..., 0].astype(np.float64) * distance_m + offset_m[0]
     north_m = directions[..., 1].astype(np.float64) * distance_m + offset_m[1]
     width_m = distance_m.astype(np.float64) * pixel_rad
-    depth = np.empty(distance_m.size, dtype=np.float32)
-    tiles = ice_tiles(layer.texture_seed)
     if layer.kind == "contrail":
         rise = np.maximum(np.abs(directions[..., 2:].astype(np.float64)), 1.0 / _MOST_SLANT)
         slant = (directions[..., :2] / rise).reshape(-1, 2)
         places = np.column_stack([east_m.ravel(), north_m.ravel(), width_m.ravel(), slant])
-        _trail_depth(tiles, _trails(layer), places, depth)
+        depth = np.empty(distance_m.size, dtype=np.float32)
+        _trail_depth(ice_tiles(layer.texture_seed), _trails(layer), places, depth)
     else:
         cosine, sine = (float(turn(np.radians(layer.heading_deg))) for turn in (np.cos, np.sin))
         along_m, across_m = east_m * cosine + north_m * sine, north_m * cosine - east_m * sine
         places = np.stack([along_m.ravel(), across_m.ravel(), width_m.ravel()], axis=-1) / layer.feature_size_m
-        threshold = float(ndtri(np.clip(1.0 - layer.cover_fraction, 1e-4, 1.0 - 1e-4)))
-        _ice_depth(tiles, body_tile(layer.texture_seed, _BODY_SLOPE), places, threshold, depth)
+        depth = _ice_depth(layer, _ice_at(places, layer.texture_seed))
     result: _Field = np.float32(layer.optical_depth) * depth.reshape(distance_m.shape)
     return result
 

@@ -80,7 +80,7 @@ def test_cover_is_the_share_of_the_plan(kind: str, cover: float) -> None:
 
 def test_no_cloud_without_cover_and_no_sky_under_an_overcast() -> None:
     rays = upwards()
-    for kind in ("cumulus", "stratus"):
+    for kind in ("cumulus", "stratus", "cirrus"):
         clear = EnvironmentRadiance(environment()).radiance(rays)
         none = EnvironmentRadiance(environment(clouds=(layer(kind=kind, cover_fraction=0.0),)))
         np.testing.assert_allclose(none.radiance(rays), clear, rtol=1e-3)
@@ -255,8 +255,9 @@ def test_cirrus_thins_out_smoothly() -> None:
     """Its depth has no two heaps, nothing and all: Sarle's coefficient is 0.56 for even spread, 0.33 for normal."""
     coefficients = []
     for seed in range(4):
+        # Under less cover the open sky makes the distribution skew.
         cirrus = layer(kind="cirrus", height_above_camera_m=4000.0, feature_size_m=4000.0, optical_depth=0.5,
-                       texture_seed=seed)  # fmt: skip
+                       cover_fraction=0.7, texture_seed=seed)  # fmt: skip
         opacity = render_cloud_layer(cirrus, looking(160, 120, 800.0, 35.0), SIDE_LIGHT).opacity.ravel()
         centred = (opacity - opacity.mean()) / opacity.std()
         coefficients.append((np.mean(centred**3) ** 2 + 1) / np.mean(centred**4))
