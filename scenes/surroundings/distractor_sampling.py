@@ -78,6 +78,8 @@ def sample_distractor(rng: np.random.Generator, scene: DistractorScene) -> Obsta
     pitch, yaw, roll = np.radians(rng.uniform(-1.0, 1.0, 3) * (40.0, 40.0, 180.0))
     attitude = rotation_from_angles(pitch, yaw, roll)
     paint = _DISTRACTOR_PAINTS[int(rng.integers(len(_DISTRACTOR_PAINTS)))]
+    # Room for the object itself, which is the larger the farther away it is.
+    depth_m += shape.radius_m + shape.tube_radius_m
     return Obstacle(
         kind="distractor",
         shape=shape,

@@ -9,14 +9,17 @@ import pytest
 import trimesh
 
 from datasets_manifest.recipe.aircraft_ranges import ReceiverRanges
+from datasets_manifest.recipe.drogue_ranges import DistractorForm
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.meshes import obstacle_mesh
 from drogue_models.obstacles import DISTRACTOR_BODIES, PROBE_FORMS
 from drogue_models.surroundings.bystanders import bystander_surface
-from geometry.se3 import Array
+from geometry.se3 import Array, RigidTransform
 from render.surfaces import frame_tanker_surfaces
 from scenes.sampler import sample_frame
+from scenes.surroundings.distractor_sampling import DistractorScene, sample_distractor
 from scenes.surroundings.receiver_sampling import receiver_of_scene
 from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
@@ -143,6 +146,23 @@ def test_distractors_stay_behind_the_drogue(index: int) -> None:
         # The middle keeps 1 m beyond the rim; a large body reaches nearer by its own size at most.
         assert vertices_left_m(found)[:, 2].max() > frame.left_from_drogue.translation_m[2] + 1.0
         assert found.left_from_object.translation_m[2] > frame.left_from_drogue.translation_m[2]
+
+
+@pytest.mark.parametrize("form", ["ball", "disc", "ring"])
+def test_plain_distractors_stay_behind_the_drogue_however_far_it_is(form: DistractorForm) -> None:
+    rng, rim_m = np.random.default_rng(6), 60.0
+    scene = DistractorScene(
+        rig=recipe().rig,
+        forms=(form,),
+        nearest_m=rim_m,
+        world_from_left=RigidTransform.identity(),
+        left_from_tanker=None,
+        tanker=(),
+    )
+    for _ in range(100):
+        drawn = sample_distractor(rng, scene)
+        mesh = obstacle_mesh(drawn.shape)
+        assert drawn.left_from_object.apply(np.asarray(mesh.vertices))[:, 2].min() > rim_m
 
 
 @pytest.mark.parametrize("form", ["roundel", "lamp", "antenna"])
