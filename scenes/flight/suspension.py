@@ -10,7 +10,7 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.aircraft_ranges import HoseRanges
 from datasets_manifest.recipe.sequence_ranges import HoseParameters
 from drogue_models.frozen_model import ReflectanceRgb
-from drogue_models.parameters import DrogueParameters
+from drogue_models.parameters import BORE_LENGTH_FRACTION, DrogueParameters
 from drogue_models.surface_looks import HoseBand, HoseLook
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
@@ -18,8 +18,9 @@ from scenes.flight.towed_hose import HOSE_LINKS, HoseEnds, hose_at_rest
 
 # World axes of a tanker that flies east: aft, right wing, up.
 WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
-# Length of hose inside the coupling's tail, so that no gap shows.
-HOSE_OVERLAP_M = 0.02
+# Length of hose inside the coupling's tail, so that no gap shows, and at most so much of what is solid of the coupling,
+# so that it does not show in the mouth.
+_HOSE_OVERLAP_M, _HOSE_OVERLAP_FRACTION = 0.02, 0.9
 
 HOSE_NODES = 17
 # Position of the drogue behind and below the pod: equilibrium of a 15 m hose at 120 m/s in a lumped-mass model.
@@ -139,7 +140,9 @@ def sample_suspension(
 
 def hose_tail_m(drogue: DrogueParameters) -> float:
     """Where the hose begins on the drogue's axis, behind the rim plane. [m]"""
-    return drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
+    solid_m = (1.0 - BORE_LENGTH_FRACTION) * drogue.coupling_length_m
+    overlap_m = min(_HOSE_OVERLAP_M, _HOSE_OVERLAP_FRACTION * solid_m)
+    return drogue.hub_depth_m + drogue.coupling_length_m - overlap_m
 
 
 def hang_hose(

@@ -10,6 +10,10 @@ import pytest
 from datasets_manifest.recipe.aircraft_ranges import HoseRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.meshes import drogue_meshes
+from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import Part
+from drogue_models.presets import load_drogue
 from geometry.se3 import Array
 from scenes.flight.suspension import hose_look_of_scene, hose_of_scene, hose_tail_m
 from scenes.sampler import sample_frame
@@ -62,6 +66,19 @@ def test_a_thicker_hose_weighs_more_and_a_wider_drogue_drags_more() -> None:
     assert thick.mass_per_length_kg_m == pytest.approx(4 * thin.mass_per_length_kg_m)
     assert thick.drogue_diameter_m == pytest.approx(1.32)
     assert thick.drogue_mass_kg == pytest.approx(4 * thin.drogue_mass_kg)
+
+
+@pytest.mark.parametrize("preset", ["red-8", "cone-orange"])
+@pytest.mark.parametrize("length_m", [0.004, 0.02, 0.035, 0.06])
+def test_the_hose_ends_in_the_solid_part_of_the_coupling(preset: str, length_m: float) -> None:
+    whole = load_drogue(preset).model_dump()
+    if "body" in whole:
+        # As deep a mouth as such a coupling may have.
+        whole["body"]["coupling"]["guide_length_m"] = 0.53 * length_m
+    drogue = DrogueParameters.model_validate(whole | {"coupling_length_m": length_m})
+    corners = np.asarray(drogue_meshes(drogue)[int(Part.COUPLING)].vertices)
+    on_axis_m = corners[np.hypot(corners[:, 0], corners[:, 1]) < 1e-9, 2]
+    assert on_axis_m.min() < hose_tail_m(drogue) < on_axis_m.max()
 
 
 @pytest.mark.parametrize("index", range(6))
