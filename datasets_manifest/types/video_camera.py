@@ -42,7 +42,8 @@ class Window(FrozenModel):
         seed: decides where its marks are; each eye looks through another part of it.
         dirt_fraction: largest share of light that a spot of dirt takes.
         scratches, drops: how many, in the view of an eye.
-        reflection_fraction: largest luminance of what it reflects, over the mean luminance of the view.
+        reflection_fraction: largest luminance of what it reflects, over the sum of two: the mean of the view without
+            the sun's disc, and a white diffuser in the sun.
     """
 
     seed: int = Field(ge=0)

@@ -44,16 +44,17 @@ def light_on_sensor(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np
     """
     camera = frame.camera
     image = _defocused(frame, seen, eye)
+    sun = _sun_on_lens(frame, seen, eye)
+    brightest_cd_m2 = _BRIGHTEST_BLOOM * saturation_cd_m2(frame)
     if camera is not None and camera.window is not None:
-        image = see_through(image, camera.window, eye)
+        image = see_through(image, camera.window, eye, brightest_cd_m2, np.zeros(3) if sun is None else sun[1])
     image = blur(image, frame.sensor.psf_sigma_px)
     lens = frame.rig.lens(eye)
     eye_camera = frame.rig.camera if lens is None else lens.camera
     if camera is not None and (camera.lens.lateral_red_px or camera.lens.lateral_blue_px):
         image = shift_colors(image, camera.lens, eye_camera)
     if camera is not None and camera.lens.bloom_fraction > 0:
-        image = add_bloom(image, camera.lens.bloom_fraction, _BRIGHTEST_BLOOM * saturation_cd_m2(frame))
-    sun = _sun_on_lens(frame, seen, eye)
+        image = add_bloom(image, camera.lens.bloom_fraction, brightest_cd_m2)
     if sun is not None:
         image = cv2.add(image, _sun_glare(frame, eye, *sun))
         if camera is not None and camera.lens.ghost_fraction > 0:

@@ -109,26 +109,32 @@ def ghosts(
     return _enlarged(layer, camera.width_px, camera.height_px)
 
 
-def see_through(light: Light, window: Window, eye: Eye) -> Light:
+def see_through(light: Light, window: Window, eye: Eye, most_cd_m2: float, sun_lux: NDArray[np.float64]) -> Light:
     """The light behind a window: less of it, and what the window's marks scatter and its surface reflects.
+
+    Both follow the mean of the view and the sun, in whose light a white diffuser has the luminance E / pi.
 
     Args:
         light: (H, W, 3). [cd/m2]
         window: before the lens.
         eye: which part of it is in the way.
+        most_cd_m2: light beyond this is left out of the mean: the sun's disc, which counts by `sun_lux` whether the
+            picture holds it or not.
+        sun_lux: (3,) illuminance of the window by the sun.
     """
     height, width = light.shape[:2]
     kept, scattered = _window_marks(window, eye, width, height)
-    mean = np.array(cv2.mean(_reduced(light, 8))[:3], dtype=np.float32)
+    mean = np.array(cv2.mean(_reduced(np.minimum(light, np.float32(most_cd_m2)), 8))[:3])
+    luminance = (mean + sun_lux / np.pi).astype(np.float32)
     kept = _enlarged(cv2.merge([kept, kept, kept]), width, height)
-    added = _enlarged(scattered[..., None] * np.minimum(mean, light.max()), width, height)
+    added = _enlarged(scattered[..., None] * luminance, width, height)
     result: Light = cv2.add(cv2.multiply(light, kept), added)
     return result
 
 
 @lru_cache(maxsize=4)
 def _window_marks(window: Window, eye: Eye, width_px: int, height_px: int) -> tuple[Light, Light]:
-    """Share of the light that passes, and luminance that is added over the view's mean, on a coarse grid.
+    """Share of the light that passes, and luminance that is added over that of the surroundings, on a coarse grid.
 
     A mark a hand's breadth away is blurred over some 20 pixels of the paper's camera.
     """

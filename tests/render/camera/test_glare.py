@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer
 from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.video_camera import VideoCamera, Window
 from geometry.distortion import BrownConrady, Lens
 from geometry.se3 import exp_twist
 from geometry.stereo import EYES, Eye, StereoRig
-from render.camera.optics import glare_spread_per_sr, sun_glare
+from render.background import background
+from render.camera.optics import glare_spread_per_sr, light_on_sensor, sun_glare
 from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import environment_radiance
@@ -98,6 +102,18 @@ def test_the_veil_of_a_lens_is_brightest_where_it_shows_the_sun(side: Eye) -> No
         assert (hidden is None) == is_hidden
         if hidden is not None:
             np.testing.assert_array_equal(luminance(hidden), veil)
+
+
+def test_a_window_is_as_bright_with_the_sun_just_inside_the_picture_as_just_outside() -> None:
+    camera, added = VideoCamera(window=Window(seed=5, scratches=6)), []
+    for azimuth_deg in (15.2, 17.2):
+        frame = with_sun(10.5, azimuth_deg)
+        seen = replace(eye(frame), radiance_cd_m2=background(frame))
+        behind = light_on_sensor(frame.model_copy(update={"camera": camera}), seen, "left")
+        added.append(luminance(behind - light_on_sensor(frame, seen, "left")).mean())
+        assert (seen.radiance_cd_m2.max() > 1e8) == (azimuth_deg < 16)
+    # The sky around the sun is part of the view inside; the disc itself would add fifteen times as much.
+    assert added[0] == pytest.approx(added[1], rel=0.15)
 
 
 def test_a_sun_that_a_lens_folds_into_the_image_is_not_hidden_by_what_stands_there() -> None:

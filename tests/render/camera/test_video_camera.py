@@ -202,10 +202,21 @@ def test_ghosts_lie_on_the_line_through_the_sun_and_hold_its_share_of_light() ->
 def test_each_eye_looks_through_another_part_of_the_same_window() -> None:
     window = Window(seed=7, dirt_fraction=0.1, scratches=5, drops=5, reflection_fraction=0.05)
     light = np.full((HEIGHT, WIDTH, 3), 100.0, np.float32)
-    left, again, right = (see_through(light, window, eye) for eye in ("left", "left", "right"))
+    left, again, right = (see_through(light, window, eye, np.inf, np.zeros(3)) for eye in ("left", "left", "right"))
     np.testing.assert_array_equal(left, again)
     assert np.abs(left - right).max() > 1.0
     assert left.min() > 40.0 and left.max() < 250.0
+
+
+def test_a_window_scatters_sunlight_as_it_does_that_of_as_bright_a_view() -> None:
+    window = Window(seed=7, dirt_fraction=0.1, scratches=5)
+    dark, light = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.full((HEIGHT, WIDTH, 3), 100.0, np.float32)
+    by_view = see_through(light, window, "left", np.inf, np.zeros(3)) - see_through(
+        light, window, "left", 0, np.zeros(3)
+    )
+    by_sun = see_through(dark, window, "left", np.inf, np.full(3, 100.0 * np.pi))
+    # The first is a difference of float32 numbers around 100.
+    np.testing.assert_allclose(by_sun, by_view, atol=1e-4)
 
 
 def lag_one(picture: Pixels, other: Pixels) -> float:
