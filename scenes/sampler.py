@@ -336,8 +336,8 @@ def automatic_exposure(
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
     time_s = law.time_s
     if time_s is None:
-        nearest_to_one = min(max(1.0, gain.low), gain.high)
-        time_s = float(np.clip(wanted_s / nearest_to_one, law.auto_time_s.low, law.auto_time_s.high))
+        # A site holds no more than its full well, however low the gain.
+        time_s = float(np.clip(wanted_s / max(1.0, gain.low), law.auto_time_s.low, law.auto_time_s.high))
     gain_used = float(np.clip(wanted_s / time_s, gain.low, gain.high))
     return Exposure(time_s=time_s, f_number=law.f_number, gain=gain_used)
 

@@ -226,12 +226,13 @@ class ExposureLaw(FrozenModel):
     Attributes:
         time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
         auto_time_s: shortest and longest time that the meter chooses. [s]
-        auto_gain: range of the gain; a single number is a fixed gain.
+        auto_gain: range of the gain; a single number is a fixed gain. A gain below 1 darkens the picture, and its time
+            is that of gain 1.
         auto_meter: what the meter measures: `view`, the brighter of the view's mean and a white plate that faces the
             camera; `plate`, the plate alone, as a meter that measures the drogue and not the sky behind it; or
             `highlights`, as `view`, but nine tenths of the view stay below white.
-        auto_level_fraction: level at which the meter puts that, as a share of the full well or, at gains other than 1,
-            of the signal that saturates the converter.
+        auto_level_fraction: level at which the meter puts that, as a share of the full well or, at gains above 1, of
+            the signal that saturates the converter.
         f_number: of the lens; with the time it sets how much light the sensor receives.
     """
 

@@ -67,6 +67,12 @@ def test_a_low_gain_takes_a_shortest_time_that_is_too_long() -> None:
     assert got.gain == pytest.approx(0.5, rel=1e-12)
 
 
+def test_a_gain_below_one_darkens_and_fills_no_site_beyond_its_full_well() -> None:
+    assert exposure_of(auto_gain=0.25) == FREE.model_copy(update={"gain": 0.25})
+    assert exposure_of(auto_gain=[0.1, 0.5]) == FREE.model_copy(update={"gain": 0.5})
+    assert exposure_of(auto_gain=[0.5, 4]) == FREE
+
+
 def test_a_fixed_time_keeps_its_gain_or_meters_it() -> None:
     time_s = FREE.time_s / 8
     assert exposure_of(time_s=time_s).gain == 1
