@@ -66,7 +66,7 @@ class ImageProcessing(FrozenModel):
             smaller exposure factor.
         contrast: of the S-shaped part of the tone curve; 0 is the sRGB curve alone, negative is flat.
         black_fraction: level of black in the picture; negative crushes shadows.
-        saturation: factor on chroma.
+        saturation: factor on chroma; above 1 strong colours gain less.
         denoise_sigma_px: blur of the smoothed picture that fine detail is taken from. [px]
         kept_detail_fraction: share of faint detail, and noise, that denoising leaves.
         denoise_threshold: detail is faint below so many standard deviations of the noise at its level.

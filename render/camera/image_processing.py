@@ -151,7 +151,9 @@ def _split(
             y = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
             strong = max(abs(b - y), abs(r - y)) / np.float32(_LEVELS)
             bright = max(y - np.float32(_HIGHLIGHT_LEVEL), np.float32(0.0)) / np.float32(255.0 - _HIGHLIGHT_LEVEL)
-            amount = np.float32(1.0) + (saturation - np.float32(1.0)) * (np.float32(1.0) - strong)
+            # Only more saturation spares strong colours: less of it ends at grey.
+            spared = strong if saturation > np.float32(1.0) else np.float32(0.0)
+            amount = np.float32(1.0) + (saturation - np.float32(1.0)) * (np.float32(1.0) - spared)
             amount *= np.float32(1.0) - np.float32(_FADING) * bright * bright
             luma[row, column] = y
             blue[row, column] = amount * (b - y)

@@ -302,6 +302,20 @@ def test_saturation_spares_strong_colours_and_highlights_fade(
     np.testing.assert_allclose(got[[0, 2]], expected, atol=2.0)
 
 
+@pytest.mark.parametrize("saturation", [0.0, 0.5])
+def test_less_saturation_takes_as_much_of_strong_colours(frame: FrameSpec, saturation: float) -> None:
+    """At 0 all is grey."""
+    pair, middle = tinted_pair(0.2, (1.0, 0.3, 0.02), frame), (slice(20, -20), slice(20, -20))
+    chroma = []
+    for factor in (1.0, saturation):
+        camera = VideoCamera(processing=ImageProcessing(saturation=factor))
+        red, _, blue = expose(with_camera(frame, camera), pair).left[middle].mean(axis=(0, 1))
+        chroma.append(red - blue)
+    assert chroma[0] > 100
+    # Pictures are of whole numbers.
+    assert chroma[1] == pytest.approx(saturation * chroma[0], abs=1.0)
+
+
 def test_darkness_is_denoised_over_wider_parts(frame: FrameSpec) -> None:
     """At the same level the noise of a high gain is correlated farther."""
     farther = []
