@@ -50,7 +50,8 @@ def _lens_directions(lens: Lens, rotation: NDArray[np.float64], step_px: int) ->
     return directions
 
 
-@lru_cache(maxsize=4)
+# Both eyes in three steps.
+@lru_cache(maxsize=6)
 def lens_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
     """(h, w, 3) unit directions in the rectified axes of the eye, through every pixel or the grid of `_grid_px`."""
     camera = lens.camera
@@ -96,32 +97,42 @@ def _sharp_background(
     return image
 
 
-def air_in_front(frame: FrameSpec, pixel: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Airlight and extinction along pixel centres, the same in both eyes.
+def air_in_front(
+    frame: FrameSpec, eye: Eye, pixel: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Airlight and extinction along pixel centres, the same in two ideal eyes.
 
     Args:
         frame: gives air and camera at mid-exposure.
+        eye: whose pixels.
         pixel: (P,) flat indices.
 
     Returns:
         (P, 3) radiance of infinitely deep air in the pixel's direction [cd/m2], and (P,) optical depth per planar
         depth. [1/m]
     """
-    ambient, camera, step = environment_radiance(frame.environment), frame.rig.camera, _AIR_STEP_PX
-    columns, rows = camera.width_px // step + 2, camera.height_px // step + 2
-    rotation = frame.world_from_left.rotation
-    coarse = ambient.airlight(_directions(camera, rotation, np.arange(columns) * step, np.arange(rows) * step))
+    ambient, camera, lens = environment_radiance(frame.environment), frame.rig.camera, frame.rig.lens(eye)
+    rotation, step = frame.world_from_left.rotation, _AIR_STEP_PX
     v, u = (index.astype(np.float32) for index in np.divmod(pixel, camera.width_px))
-    scale = np.float32(1 / step)
+    # Rows and columns of the coarse grid.
+    across, down = u * np.float32(1 / step), v * np.float32(1 / step)
+    if lens is None:
+        columns, rows = camera.width_px // step + 2, camera.height_px // step + 2
+        directions = _directions(camera, rotation, np.arange(columns) * step, np.arange(rows) * step)
+        x, y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
+        length = np.sqrt(1.0 + x * x + y * y)
+    else:
+        directions = _lens_directions(lens, rotation, step)
+        first = np.float32((0.5 + 0.5 * step) / step)
+        across, down = across + first, down + first
+        length = 1.0 / lens_rays(lens, 1).reshape(-1, 3)[pixel, 2]
+    coarse = ambient.airlight(directions)
     # remap takes at most 2^15 rows or columns.
     light = np.empty((len(pixel), 3), dtype=np.float32)
-    for first in range(0, len(pixel), _MOST_REMAP_ROWS):
-        part = slice(first, first + _MOST_REMAP_ROWS)
-        places = (u[part] * scale)[:, None], (v[part] * scale)[:, None]
-        light[part] = sample_bilinear(coarse, *places)[:, 0]
-    x, y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
-    per_depth = ambient.extinction_per_m * np.sqrt(1.0 + x * x + y * y)
-    return light, per_depth.astype(np.float32)
+    for begin in range(0, len(pixel), _MOST_REMAP_ROWS):
+        part = slice(begin, begin + _MOST_REMAP_ROWS)
+        light[part] = sample_bilinear(coarse, across[part, None], down[part, None])[:, 0]
+    return light, (ambient.extinction_per_m * length).astype(np.float32)
 
 
 def backgrounds(frame: FrameSpec) -> dict[Eye, NDArray[np.float32]]:

@@ -263,7 +263,7 @@ class Compositor:
         """
         shown, clear = np.empty((*light.shape[:2], 3), dtype=np.float32), np.empty((len(pixel), 1), dtype=np.float32)
         for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
-            air, optical_depth_per_m = air_in_front(self.frame, own_pixel)
+            air, optical_depth_per_m = air_in_front(self.frame, eye, own_pixel)
             clear[own] = self.eyes[eye].air_transmittance(own_pixel, optical_depth_per_m)
             behind = self.background[eye].reshape(-1, 3)[own_pixel]
             # What a sample shows if it hits a part, less what it shows if it misses.

@@ -131,11 +131,11 @@ class BlenderEngine:
         for eye in EYES:
             # A difference is light and coverage too, and the air attenuates it alike.
             difference = traced[eye].with_light(half_differences[eye].pixel, half_differences[eye].light)
-            difference.apply_air(*air_in_front(frame, difference.pixel))
+            difference.apply_air(*air_in_front(frame, eye, difference.pixel))
             half_differences[eye] = _HalfDifference(
                 pixel=difference.pixel, light=np.column_stack([difference.radiance_cd_m2, difference.coverage])
             )
-            air, optical_depth_per_m = air_in_front(frame, traced[eye].pixel)
+            air, optical_depth_per_m = air_in_front(frame, eye, traced[eye].pixel)
             traced[eye].apply_air(air, optical_depth_per_m)
             traced[eye].limit_edges(optical_depth_per_m)
         eyes = {eye: traced[eye].composite_over(background[eye]) for eye in EYES}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec, Optics
+from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import Eye
@@ -61,7 +62,7 @@ def light_on_sensor(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np
             image = cv2.add(image, ghosts(camera.lens, eye_camera, *sun))
     optics = frame.sensor.optics
     if optics.natural_vignetting or optics.mechanical_falloff_fraction > 0:
-        share = transmission(eye_camera, optics)
+        share = transmission(eye_camera, optics, lens)
         # OpenCV takes a third of the time of numpy's product with one channel.
         shaded: NDArray[np.float32] = cv2.multiply(image, cv2.merge([share, share, share]))
         return shaded
@@ -92,19 +93,27 @@ def blur(radiance: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=4)
-def transmission(camera: PinholeCamera, optics: Optics) -> NDArray[np.float32]:
+def transmission(camera: PinholeCamera, optics: Optics, lens: Lens | None = None) -> NDArray[np.float32]:
     """(H, W) illuminance of each pixel relative to the axis.
 
     Source: illuminance falls with cos^4 of the angle from the axis (natural vignetting, EMVA Standard 1288); the
     mechanical falloff is our model, `1 - a rho^4`, with rho the distance from the principal point over that of the
     farthest corner.
+
+    Args:
+        camera: of the eye.
+        optics: which of the two, and how much.
+        lens: of the eye, whose distortion moves pixels from their rays; None for an ideal one.
     """
     u = np.arange(camera.width_px) - camera.cx_px
     v = np.arange(camera.height_px) - camera.cy_px
     square_px = u**2 + v[:, None] ** 2
     share = 1.0 - optics.mechanical_falloff_fraction * (square_px / square_px.max()) ** 2
     if optics.natural_vignetting:
-        share /= (1.0 + (u / camera.fx_px) ** 2 + (v[:, None] / camera.fy_px) ** 2) ** 2
+        if lens is None:
+            share /= (1.0 + (u / camera.fx_px) ** 2 + (v[:, None] / camera.fy_px) ** 2) ** 2
+        else:
+            share *= (lens_rays(lens, 1) @ lens.ideal_from_real[:, 2]) ** 4
     result: NDArray[np.float32] = share.astype(np.float32)
     return result
 

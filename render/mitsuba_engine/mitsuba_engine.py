@@ -93,10 +93,10 @@ class MitsubaEngine:
         started = time.process_time()
         for eye in EYES:
             seen, duplicate = traced.eyes[eye], traced.duplicates[eye]
-            air, optical_depth_per_m = air_in_front(frame, seen.pixel)
+            air, optical_depth_per_m = air_in_front(frame, eye, seen.pixel)
             seen.apply_air(air, optical_depth_per_m)
             seen.limit_edges(optical_depth_per_m)
-            traced.duplicate_error[eye] *= duplicate.apply_air(*air_in_front(frame, duplicate.pixel))
+            traced.duplicate_error[eye] *= duplicate.apply_air(*air_in_front(frame, eye, duplicate.pixel))
         if not self._is_noted:
             note_kernels(self.variant)
             self._is_noted = True

@@ -9,7 +9,7 @@ from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye, StereoRig
-from render.background import add_stars, background
+from render.background import add_stars, air_in_front, background
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
@@ -169,3 +169,22 @@ def test_a_lens_that_folds_right_beyond_its_image_shows_the_sky_up_to_the_border
     assert np.isfinite(strong).all()
     # The sky's own change over a few pixels, and of the lens's by k1.
     np.testing.assert_allclose(luminance(strong)[:4, :4], luminance(mild)[:4, :4], rtol=0.05)
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_air_in_front_of_a_lens_is_that_along_its_rays(eye: Eye) -> None:
+    """Of two wide lenses, one turned, at random pixels."""
+    frame = sample_frame(paper_view_recipe(scale=0.25), 0)
+    wide, strong = PinholeCamera(320, 240, 250.0, 250.0, 159.5, 119.5), BrownConrady(k1=0.3)
+    turned = Lens(wide, strong, exp_twist([0, 0, 0, 0.02, -0.03, 0.05]).rotation)
+    rig = StereoRig(wide, 0.12, lenses=(Lens(wide, strong), turned))
+    places = np.random.default_rng(4).integers(0, (320, 240), (500, 2))
+    got = air_in_front(frame.model_copy(update={"rig": rig}), eye, places[:, 1] * 320 + places[:, 0])
+    rays = rig.rays(places.astype(float), eye)
+    length = np.linalg.norm(rays, axis=-1)
+    ambient = environment_radiance(frame.environment)
+    # Float32.
+    np.testing.assert_allclose(got[1], ambient.extinction_per_m * length, rtol=1e-6)
+    directions = frame.world_from_left.rotate(rays / length[:, None]).astype(np.float32)
+    # Linear interpolation over 32 px, 7 degrees, of air that varies over tens of degrees.
+    np.testing.assert_allclose(got[0], ambient.airlight(directions[None])[0], rtol=0.005)

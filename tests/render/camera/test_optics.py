@@ -7,7 +7,9 @@ import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.frame import Exposure, FrameSpec, Optics
+from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
+from geometry.se3 import exp_twist
 from render.camera.optics import blur_circle_px, disc_kernel, light_on_sensor, transmission
 from render.camera.sensor import expose
 from render.engine import EyeRadiance, load_engine
@@ -42,6 +44,16 @@ def test_natural_vignetting_is_cos4_of_the_ray() -> None:
     rays = CAMERA.rays(np.stack([u, v], axis=-1))
     cosine = 1.0 / np.linalg.norm(rays, axis=-1)
     np.testing.assert_allclose(share, cosine**4, rtol=1e-6)  # float32
+
+
+def test_natural_vignetting_behind_a_lens_is_cos4_of_its_ray_from_its_own_axis() -> None:
+    lens = Lens(CAMERA, BrownConrady(k1=0.3, p1=0.01), exp_twist([0, 0, 0, 0.02, -0.03, 0.05]).rotation)
+    v, u = np.mgrid[:48, :64]
+    rays = lens.rays(np.stack([u, v], axis=-1)) @ lens.ideal_from_real
+    cosine = rays[..., 2] / np.linalg.norm(rays, axis=-1)
+    share = transmission(CAMERA, Optics(natural_vignetting=True), lens)
+    np.testing.assert_allclose(share, cosine**4, rtol=1e-6)  # float32
+    assert share[0, 0] > 1.1 * transmission(CAMERA, Optics(natural_vignetting=True))[0, 0]
 
 
 def test_mechanical_falloff_takes_its_share_in_the_corner_only() -> None:
