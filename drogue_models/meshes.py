@@ -39,16 +39,20 @@ _SMALLEST_BODY_M, _LARGEST_BODY_M = 0.05, 10.0
 _ARCHIVES = {"bz2", "gz", "tar.bz2", "tar.gz", "zip", "3mf", "3dxml", "zae"}
 # Cosine of a hose's direction with the x axis beyond which its rings begin at the y axis.
 _STEEP = 0.9
-# float32 files round a front at z = 0 by this much for bodies of a few metres.
-_FRONT_TOLERANCE_M = 1e-6
+# float32 files round a front at z = 0, or a radius, by this much for bodies of a few metres.
+_TOLERANCE_M = 1e-6
 
 
-def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
+def load_body_mesh(body: BodyMesh, rim_radius_m: float) -> trimesh.Trimesh:
     """A user's mesh of the drogue's body, in the drogue frame (z from the mouth to the hose, z >= 0). [m]
+
+    Args:
+        body: the file.
+        rim_radius_m: of the drogue, whose outermost radius it is. [m]
 
     Raises:
         ValueError: the file is missing, has another hash than when the drogue was loaded, cannot be read as a mesh, or
-            is not a closed body of plausible size behind the rim plane.
+            is not a closed body of plausible size behind the rim plane and no wider than the rim.
     """
     file = body.file
     try:
@@ -65,7 +69,7 @@ def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
             f"got {sha256}"
         )
     mesh = _parse_body_mesh(data, file.suffix.lower().removeprefix("."), str(file))
-    fault = _body_mesh_fault(mesh)
+    fault = _body_mesh_fault(mesh, rim_radius_m)
     if fault:
         raise ValueError(f"body_mesh: {file} {fault}")
     return mesh
@@ -86,7 +90,7 @@ def _parse_body_mesh(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
     return mesh
 
 
-def _body_mesh_fault(mesh: trimesh.Trimesh) -> str | None:
+def _body_mesh_fault(mesh: trimesh.Trimesh, rim_radius_m: float) -> str | None:
     """Why the mesh cannot be used, and what to do; None for a valid mesh."""
     if not np.isfinite(mesh.vertices).all():
         return "has vertices that are not finite; export it again"
@@ -98,8 +102,15 @@ def _body_mesh_fault(mesh: trimesh.Trimesh) -> str | None:
         return (
             f"must be {_SMALLEST_BODY_M:g} to {_LARGEST_BODY_M:g} m in size, with coordinates in metres, got {size_m:g}"
         )
-    if low[2] < -_FRONT_TOLERANCE_M:
+    if low[2] < -_TOLERANCE_M:
         return f"must lie behind the rim plane (z >= 0, z from the mouth to the hose), got z down to {low[2]:g} m"
+    # Distances and places are drawn so that the rim is in view.
+    radius_m = float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max())
+    if radius_m > rim_radius_m + _TOLERANCE_M:
+        return (
+            f"must lie within rim_radius_m, {rim_radius_m:g} m, of the z axis, got {radius_m:g} m; make the mesh "
+            "narrower or the rim wider"
+        )
     if not mesh.is_watertight:
         return "must be closed (watertight); close its holes and export it again"
     if not mesh.is_winding_consistent or mesh.volume <= 0:
@@ -189,7 +200,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
         return body_meshes(drogue)
     meshes = {int(Part.FACE): _face(drogue), int(Part.RIM): rim(drogue)}
     if drogue.body_mesh is not None:
-        meshes[int(Part.COUPLING)] = load_body_mesh(drogue.body_mesh)
+        meshes[int(Part.COUPLING)] = load_body_mesh(drogue.body_mesh, drogue.rim_radius_m)
     else:
         meshes[int(Part.CANOPY)] = _canopy(drogue)
         meshes[int(Part.COUPLING)] = _coupling(drogue)

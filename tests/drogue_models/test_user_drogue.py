@@ -150,6 +150,7 @@ def _not_finite(mesh: trimesh.Trimesh) -> None:
         (lambda mesh: mesh.apply_scale(1000.0), "coordinates in metres, got 300"),
         (lambda mesh: mesh.apply_scale(0.001), "coordinates in metres, got 0.0003"),
         (lambda mesh: mesh.apply_translation([0.0, 0.0, -0.3]), "behind the rim plane .* got z down to -0.05 m"),
+        (lambda mesh: mesh.apply_translation([0.24, 0.0, 0.0]), "within rim_radius_m, 0.33 m, .* got 0.34 m; make"),
     ],
 )
 def test_unfit_meshes_are_refused(tmp_path: Path, spoil: Callable[[trimesh.Trimesh], object], message: str) -> None:
@@ -160,6 +161,12 @@ def test_unfit_meshes_are_refused(tmp_path: Path, spoil: Callable[[trimesh.Trime
     with pytest.raises(ValueError, match=f"body_mesh: .*body.ply .*{message}") as caught:
         drogue_meshes(drogue)
     assert "\n" not in str(caught.value)
+
+
+def test_a_mesh_may_be_as_wide_as_the_rim(tmp_path: Path) -> None:
+    tube().apply_scale([3.3, 3.3, 1.0]).export(tmp_path / "body.stl")
+    meshes = drogue_meshes(load_drogue(write_toml(tmp_path, RING + 'body_mesh = "body.stl"\n')))
+    assert meshes[int(Part.COUPLING)].bounds[1][0] == pytest.approx(0.33, abs=1e-7)  # float32
 
 
 @pytest.mark.parametrize(

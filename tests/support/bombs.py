@@ -170,9 +170,9 @@ def _read_map(path: Path) -> object:
 def _read_mesh(path: Path) -> object:
     drogue = path.with_name("drogue.toml")
     drogue.write_text(f'name = "own"\nmarker_count = 8\nmarker_ring_radius_m = 0.27\nbody_mesh = "{path.name}"\n')
-    body = load_drogue(str(drogue)).body_mesh
-    assert body is not None
-    return load_body_mesh(body)
+    loaded = load_drogue(str(drogue))
+    assert loaded.body_mesh is not None
+    return load_body_mesh(loaded.body_mesh, loaded.rim_radius_m)
 
 
 def _gltf(count: int) -> bytes:
