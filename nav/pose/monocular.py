@@ -197,13 +197,36 @@ def _best_pose(observation: Observation, poses: list[RigidTransform]) -> Solutio
     if reason is not None:
         return reason
     information = information_at(features, rotations, translations)
-    covariances, determined = inverse_information(information)
     log_weights = -costs - np.linalg.slogdet(information)[1] / 2
     weights = np.exp(log_weights[order] - log_weights[order].max())
     weights /= weights.sum()
     modes = tuple(PoseMode(poses[i], float(costs[i]), float(weight)) for i, weight in zip(order, weights, strict=True))
-    covariance = covariances[best] if determined[best] else None
-    return Solution(poses[best], left_mask(observation), covariance, modes)
+    return Solution(poses[best], left_mask(observation), _unweighted_covariance(observation, poses[best]), modes)
+
+
+def _unweighted_covariance(observation: Observation, pose: RigidTransform) -> Array | None:
+    """(6, 6) covariance of OpenCV's pose, which weighs all pixels alike; None where they do not determine a pose.
+
+    Source: `G C G^T` with `G = (J J^T)^-1 J`, J the unweighted derivatives and C the covariance of the pixels, to which
+    the tolerances of the drogue add.
+    """
+    weighted = left_features(observation)
+    seen = weighted.seen[0, 0]
+    u, v, a, b, c = weighted.measured
+    alike = replace(weighted, measured=np.stack([u, v, np.sign(a), np.zeros_like(b), np.sign(c)]))
+    state = AdjustmentState.nominal(alike, pose.rotation[None], pose.translation_m[None])
+    jacobian = linearise(alike, state).jacobian[0, :, : 2 * len(seen)].reshape(-1, 2, len(seen))[..., seen]
+    by_pose, by_departures = np.split(jacobian.reshape(len(jacobian), -1), [6])
+    inverse, determined = inverse_information((by_pose @ by_pose.T)[None])
+    if not determined[0]:
+        return None
+    gain = inverse[0] @ by_pose
+    gain_u, gain_v = np.split(gain, 2, axis=1)
+    # The inverse of a whitening matrix [[a, 0], [b, c]] is a root of its pixel's covariance.
+    a, b, c = (each[0, 0, seen] for each in (a, b, c))
+    roots = np.concatenate([(gain_u - gain_v * b / c) / a, gain_v / c, gain @ by_departures.T], axis=1)
+    covariance: Array = roots @ roots.T
+    return covariance
 
 
 def conic_through(points: Array) -> Array | None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geometry.circles import project_disc_centers
+from geometry.stereo import EYES
 from nav.pose.method_registry import METHODS
 from nav.pose.monocular import circle_poses, conic_through
+from nav.pose.pose_method import EXACT, Observation, StatedTolerances
 from tests.support.painted_pairs import draw_poses
 
 
@@ -62,6 +65,33 @@ def test_monocular_methods_reach_the_bound_of_one_eye(name: str, z_m: float) -> 
     ratio = np.sqrt(np.mean(np.square(ratios), axis=0))
     assert ratio.max() < 1.14 + 0.14
     assert ratio.min() > 0.96 - 0.14
+
+
+@pytest.mark.parametrize("name", ["mono-ippe", "mono-sqpnp"])
+@pytest.mark.parametrize(
+    "tolerances", [EXACT, StatedTolerances(ring_radius_m=5e-4, ellipticity=2e-3, placement_m=3e-4)]
+)
+def test_covariance_of_solvers_that_weigh_a_bad_marker_like_good_ones(name: str, tolerances: StatedTolerances) -> None:
+    rng = np.random.default_rng(57)
+    draws = draw_poses(rng, 100, 4.0, 0.03, tilt_deg=(6.0, 10.0))
+    sigma_px = np.full((2, 8), 0.03)
+    sigma_px[:, 2] = 0.3
+    squares = []
+    for index, place in enumerate(draws.places):
+        # Ring and markers depart from nominal as stated; the ellipse's direction is drawn.
+        turn, arms = rng.uniform(0, 2 * np.pi), draws.layout.centers_m[:, :2]
+        stretch = np.array([[np.cos(turn), np.sin(turn)], [np.sin(turn), -np.cos(turn)]]) * tolerances.ellipticity / 2
+        arms = arms @ (np.eye(2) * (1 + tolerances.ring_radius_m / 0.28 * rng.standard_normal()) + stretch)
+        centers = np.column_stack([arms, np.zeros(8)]) + tolerances.placement_m * rng.standard_normal((8, 3))
+        exact = [project_disc_centers(draws.rig, place, centers, np.full(8, 0.05), eye) for eye in EYES]
+        pixels = np.array(exact) + sigma_px[..., None] * rng.standard_normal((2, 8, 2))
+        cov = sigma_px[..., None, None] ** 2 * np.eye(2)
+        solution = METHODS[name](Observation(draws.rig, draws.layout, pixels, cov, tolerances=tolerances))
+        pose = solution.left_from_drogue
+        error = np.delete(draws.errors(index, pose.rotation, pose.translation_m), [3, 4])
+        squares.append(error @ np.linalg.solve(solution.covariance, error) / 6)
+    # 1 by definition, measured as 0.96-1.11; sqrt(2 / 600) = 6 %, four of it. As if well weighted, it would be 8.
+    assert 0.76 < np.mean(squares) < 1.24
 
 
 @pytest.mark.parametrize(("z_m", "z_rmse_mm"), [(2.0, 0.41), (5.0, 2.5), (10.0, 10.0)])
