@@ -29,6 +29,7 @@ from nav.pose.features import Features, left_features, stack_features
 from nav.pose.joint import misfit_reason, solve_one
 from nav.pose.marker_geometry import align_roll, left_mask, project_markers, rotations_from_axes
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, PoseMode, Solution, eye_fault, hub_fault
+from nav.pose.tilt_pairs import SAME_TURN_RAD
 
 _LEFT, _RIGHT = range(2)
 # Three image points have up to four poses.
@@ -183,7 +184,10 @@ def _disc_shift_px(observation: Observation, pose: RigidTransform) -> Array:
 
 
 def _best_pose(observation: Observation, poses: list[RigidTransform]) -> Solution | NoFixReason:
-    """The pose with the lowest reprojection cost, its covariance, and all poses as modes with Laplace weights."""
+    """The pose with the lowest reprojection cost, its covariance, and all distinct poses as modes with Laplace weights.
+
+    Both starts of IPPE may be refined to one minimum.
+    """
     features = left_features(observation).take(np.zeros(len(poses), dtype=np.int64))
     rotations = np.stack([pose.rotation for pose in poses])
     translations = np.stack([pose.translation_m for pose in poses])
@@ -192,6 +196,9 @@ def _best_pose(observation: Observation, poses: list[RigidTransform]) -> Solutio
     order = order[np.argsort(costs[order], kind="stable")]
     if not len(order):
         return NoFixReason("the solver found no pose in front of the camera")
+    axes = rotations[order, :, 2]
+    is_near = np.linalg.norm(axes[:, None] - axes, axis=2) < SAME_TURN_RAD
+    order = order[~np.tril(is_near, -1).any(axis=1)]
     best = int(order[0])
     reason = misfit_reason(features.take(slice(0, 1)), rotations[best], translations[best])
     if reason is not None:

@@ -15,7 +15,7 @@ from nav.pose.adjustment import AdjustedPoses, contiguous, inverse_information
 from nav.pose.features import Features
 
 # Starts that end closer to each other than this found one minimum.
-_SAME_TURN_RAD = 1e-4
+SAME_TURN_RAD = 1e-4
 # Keeps the affine fit of collinear markers solvable; negligible for all others.
 _RIDGE_FRACTION = 1e-12
 # Keeps the distance of coincident images finite; the cost of the adjustment is high anyway.
@@ -249,7 +249,7 @@ def _fill_weights(
                 log_weight -= np.log(lower[k, k])
             log_weight -= (axis_x * axis_x + axis_y * axis_y) / (2 * prior_rad * prior_rad)
             is_ahead = rotations[b, side, 2, 2] > 0 and translations_m[b, side, 2] > 0
-            is_other = side == 0 or turned2 > _SAME_TURN_RAD**2
+            is_other = side == 0 or turned2 > SAME_TURN_RAD**2
             weights[b, side] = log_weight if is_ahead and is_other and is_finite(log_weight) else -np.inf
         if not is_finite(weights[b, 0]) and not is_finite(weights[b, 1]):
             weights[b, 0] = 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -92,6 +94,20 @@ def test_covariance_of_solvers_that_weigh_a_bad_marker_like_good_ones(name: str,
         squares.append(error @ np.linalg.solve(solution.covariance, error) / 6)
     # 1 by definition, measured as 0.96-1.11; sqrt(2 / 600) = 6 %, four of it. As if well weighted, it would be 8.
     assert 0.76 < np.mean(squares) < 1.24
+
+
+def test_poses_of_ippe_that_are_refined_to_one_minimum_are_one_mode() -> None:
+    draws = draw_poses(np.random.default_rng(58), 60, (3.0, 8.0), 0.05)
+    single = 0
+    for index in range(60):
+        modes = METHODS["mono-ippe"](draws.observation(index)).modes
+        axes = [mode.left_from_drogue.rotation[:, 2] for mode in modes]
+        # Measured: equal to rounding, or 0.06 apart and more.
+        assert all(np.linalg.norm(one - other) > 1e-3 for one, other in combinations(axes, 2))
+        assert sum(mode.weight for mode in modes) == pytest.approx(1)
+        single += len(modes) == 1
+    # Near, where the image is far from affine, some drogues leave one minimum only.
+    assert single > 0
 
 
 @pytest.mark.parametrize(("z_m", "z_rmse_mm"), [(2.0, 0.41), (5.0, 2.5), (10.0, 10.0)])
