@@ -103,6 +103,7 @@ def estimate_pose(frame_index: int, measurement: PairMeasurement, method: str) -
         features=_features(observation, solution.used, solution.used_hub),
         stage_s=stage_s,
         regions=measurement.regions,
+        note=solution.note,
     )
 
 

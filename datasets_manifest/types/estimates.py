@@ -113,6 +113,7 @@ class PoseEstimate(FrozenModel):
         left_from_drogue: modulo the markers' symmetry; with the likeliest roll where lamps blink.
         roll_probability: of that roll among those that the markers' symmetry leaves open, by the blinking of the lamps
             in this pair and those before; None where lamps do not blink.
+        note: what the method says about this pose in one sentence, or empty.
         covariance: (6, 6) in the tangent space that `tangent` names; None where the method gives none.
         modes: every pose that explains the images, the best first; weights sum to 1.
         features: the measured image points.
@@ -139,6 +140,7 @@ class PoseEstimate(FrozenModel):
     latency_s: float | None = Field(default=None, ge=0)
     time_s: float | None = Field(default=None, exclude_if=_is_none)
     roll_probability: float | None = Field(default=None, ge=0, le=1, exclude_if=_is_none)
+    note: str = Field(default="", exclude_if=lambda note: not note)
 
 
 class NoFix(FrozenModel):

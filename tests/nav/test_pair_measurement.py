@@ -202,6 +202,13 @@ def test_a_reason_of_the_method_keeps_the_features() -> None:
     assert set(estimate.stage_s) == {"detect", "pose"}
 
 
+def test_a_pose_has_the_note_of_its_method() -> None:
+    without_hub = PairMeasurement(broken(lambda pixels, cov: None), {})
+    noted, plain = (estimate_pose(0, without_hub, method) for method in ("joint-hub", "joint"))
+    assert isinstance(noted, PoseEstimate) and "no hub was measured" in noted.note
+    assert isinstance(plain, PoseEstimate) and plain.note == ""
+
+
 def test_unknown_method() -> None:
     with pytest.raises(ValueError, match="method: there is no pose method named 'best'; there are paper, paper-lit"):
         pose_method("best")
