@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import Array, RigidTransform, read_only
+from geometry.se3 import Array, RigidTransform, log_twist, read_only
 
 _MAX_STEPS = 60
 _TOLERANCE = 1e-13
@@ -228,7 +228,7 @@ class Lens:
         ideal_from_real: (3, 3) rotation from the real eye's axes to those of the rectified rig.
 
     Raises:
-        ValueError: the distortion is not invertible over the whole image.
+        ValueError: the distortion is not invertible over the whole image, or a part of the image looks behind the rig.
     """
 
     camera: PinholeCamera
@@ -239,7 +239,12 @@ class Lens:
         # RigidTransform checks that it is a rotation.
         rotation = RigidTransform(read_only(self.ideal_from_real, (3, 3), "ideal_from_real"), np.zeros(3)).rotation
         object.__setattr__(self, "ideal_from_real", rotation)
-        _undistorted_grid(self.camera, self.distortion)
+        ahead = _with_one(_undistorted_grid(self.camera, self.distortion)) @ rotation[2]
+        if not (ahead > 0).all():
+            turn_deg = np.degrees(np.linalg.norm(log_twist(RigidTransform(rotation, np.zeros(3)))[3:]))
+            raise ValueError(
+                f"ideal_from_real: must leave the whole image before the rig, got a rotation by {turn_deg:.0f} degrees"
+            )
 
     def rays(self, real_px: ArrayLike) -> Array:
         """(..., 3) directions in the rig's axes through (..., 2) pixels of the real image, scaled to z = 1.

@@ -126,6 +126,15 @@ def test_a_fold_and_a_foreign_size_are_refused() -> None:
         StereoRig(IDEAL.camera, 0.12, lenses=(small, small))
 
 
+def test_an_eye_that_looks_behind_the_rig_is_refused() -> None:
+    camera = PinholeCamera(1280, 960, 1000.0, 1000.0, 639.5, 479.5)
+    # The border lies 32.6 degrees aside of the axis.
+    Lens(camera, ideal_from_real=rotation_from_angles(0.0, np.radians(57), 0.0))
+    for turn_deg in (58, 170):
+        with pytest.raises(ValueError, match=f"ideal_from_real: .* got a rotation by {turn_deg} degrees"):
+            Lens(camera, ideal_from_real=rotation_from_angles(0.0, np.radians(turn_deg), 0.0))
+
+
 @pytest.mark.parametrize(
     ("focal_px", "k1", "k2", "k3"),
     [
