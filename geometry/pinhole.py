@@ -18,6 +18,9 @@ class PinholeCamera:
         width_px, height_px: size of the image.
         fx_px, fy_px: focal lengths.
         cx_px, cy_px: principal point; (0, 0) is the centre of the top-left pixel.
+
+    Raises:
+        ValueError: a size that is no positive whole number, or numbers that are not finite or no focal lengths.
     """
 
     width_px: int
@@ -28,8 +31,10 @@ class PinholeCamera:
     cy_px: float
 
     def __post_init__(self) -> None:
-        if self.width_px < 1 or self.height_px < 1:
-            raise ValueError(f"width_px, height_px: must be positive, got {self.width_px}x{self.height_px}")
+        if not (_is_count(self.width_px) and _is_count(self.height_px)):
+            raise ValueError(
+                f"width_px, height_px: must be positive whole numbers, got {self.width_px!r} and {self.height_px!r}"
+            )
         if not (np.isfinite([self.fx_px, self.fy_px, self.cx_px, self.cy_px]).all() and self.fx_px > 0 < self.fy_px):
             raise ValueError(f"fx_px, fy_px: must be positive and finite, got {self.fx_px}, {self.fy_px}")
 
@@ -70,3 +75,7 @@ class PinholeCamera:
             & (p[..., 1] <= self.height_px - 1 - low)
         )
         return inside
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 1)

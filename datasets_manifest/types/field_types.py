@@ -53,7 +53,7 @@ def read_rig(value: Any) -> StereoRig:
         raise ValueError("rig: must be a table")
     try:
         return StereoRig(
-            camera=PinholeCamera(**value["camera"]),
+            camera=_read_camera(value["camera"]),
             baseline_m=value["baseline_m"],
             body_from_left=RigidTransform.from_matrix(value["body_from_left"]),
             probe_tip_body_m=value["probe_tip_body_m"],
@@ -75,7 +75,14 @@ def _read_lens(value: dict[str, Any]) -> Lens:
     distortion = value["distortion"]
     # Brown-Conrady's model has no coefficient named k4.
     model = OpenCvDistortion if "k4" in distortion else BrownConrady
-    return Lens(PinholeCamera(**value["camera"]), model(**distortion), value["ideal_from_real"])
+    return Lens(_read_camera(value["camera"]), model(**distortion), value["ideal_from_real"])
+
+
+def _read_camera(value: dict[str, Any]) -> PinholeCamera:
+    # Other programs may write whole numbers as 1280.0.
+    sizes = {name: value[name] for name in ("width_px", "height_px")}
+    whole = {name: int(size) for name, size in sizes.items() if isinstance(size, float) and size.is_integer()}
+    return PinholeCamera(**(value | whole))
 
 
 def write_rig(rig: StereoRig) -> dict[str, Any]:

@@ -98,3 +98,16 @@ def test_long_lens_models_come_back_from_json() -> None:
     # Records of rigs with short models keep the bytes that they had.
     assert list(table["lenses"][0]["distortion"]) == ["k1", "k2", "p1", "p2", "k3"]
     assert [lens.distortion for lens in TypeAdapter(Rig).validate_python(table).lenses] == [short, long]
+
+
+def test_whole_floats_are_read_as_sizes_of_images() -> None:
+    rig = resolve_rig("paper-real", 1)[0]
+    table = json.loads(json.dumps(write_rig(rig)))
+    for camera in (table["camera"], table["lenses"][0]["camera"]):
+        camera["width_px"] = float(camera["width_px"])
+    again = TypeAdapter(Rig).validate_python(table)
+    assert isinstance(again.camera.width_px, int) and isinstance(again.lenses[0].camera.width_px, int)
+    assert write_rig(again) == write_rig(rig)
+    table["camera"]["height_px"] = 960.5
+    with pytest.raises(ValueError, match=r"must be positive whole numbers, got 1280 and 960\.5"):
+        TypeAdapter(Rig).validate_python(table)

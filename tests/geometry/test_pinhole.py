@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -47,3 +50,11 @@ def test_impossible_cameras_are_refused(changes: dict[str, float]) -> None:
     values = {"width_px": 64, "height_px": 48, "fx_px": 100.0, "fy_px": 100.0, "cx_px": 31.5, "cy_px": 23.5}
     with pytest.raises(ValueError, match="must be positive"):
         PinholeCamera(**{**values, **changes})
+
+
+@pytest.mark.parametrize("size", [float("nan"), 1280.5, 1280.0, True, "1280"])
+def test_sizes_are_whole_numbers(size: Any) -> None:
+    for name in ("width_px", "height_px"):
+        with pytest.raises(ValueError, match="width_px, height_px: must be positive whole numbers"):
+            replace(CAMERA, **{name: size})
+    assert replace(CAMERA, width_px=np.int64(640)).width_px == 640
