@@ -252,6 +252,10 @@ class PairNavigator:
             return boxes
         ((eye, (x, y, width, height)),) = boxes.items()
         middle_px = np.array([x + width / 2, y + height / 2])
+        lens = self._rig.lens(eye)
+        if lens is not None:
+            # Beyond the image a lens may fold, and has no rays.
+            middle_px = np.clip(middle_px, 0.0, [lens.camera.width_px - 1.0, lens.camera.height_px - 1.0])
         # What a pixel spans there, along both axes, on a plane at a distance of one.
         steps = self._rig.rays(middle_px + np.eye(2) / 2, eye) - self._rig.rays(middle_px - np.eye(2) / 2, eye)
         depth_m = 2 * self._rim_radius_m / (np.linalg.norm(steps, axis=-1) * (width, height)).max()

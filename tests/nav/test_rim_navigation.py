@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.types.estimates import NoFix, PoseEstimate
+from datasets_manifest.types.estimates import NoFix, PoseEstimate, Region
 from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
 from geometry.distortion import BrownConrady, Lens
@@ -16,7 +16,8 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
 from geometry.stereo import StereoRig
 from nav.detector.detector import Detection, StereoDetection
-from nav.pair_navigator import PairNavigator
+from nav.pair_measurement import PairMeasurement, estimate_pose
+from nav.pair_navigator import NOT_DETECTED, PairNavigator
 from nav.pose.joint_rim import ROLL_SD_RAD
 from nav.tracking.region import rim_boxes
 from tests.support.painted_pairs import make_pose
@@ -114,6 +115,16 @@ def test_a_distorting_lens_moves_the_edge_and_not_the_pose() -> None:
     found = estimate(paint(rig, POSE), rig)
     assert isinstance(found, PoseEstimate), found
     assert np.abs(deviations(found)).max() < 4
+
+
+def test_a_box_beyond_the_image_of_a_folding_lens() -> None:
+    # It folds 205 px from the axis, where the image's corner is 200 px away and the box's middle 213 px.
+    lens = Lens(CAMERA, BrownConrady(k1=-1.45))
+    rig = replace(RIG, lenses=(lens, lens))
+    box = Region(eye="left", box_xywh_px=(-60.0, -60.0, 100.0, 100.0), source="detector", score=0.9)
+    flat = StereoImages(*np.full((2, 240, 320), 150, np.uint8), time_s=0.0, exposure_s=1e-3)
+    measured = PairNavigator(rig, BARE, Boxes(RIG)).measure_rim(flat, PairMeasurement(NOT_DETECTED, {}, regions=(box,)))
+    assert isinstance(estimate_pose(0, measured, "joint-rim"), NoFix)
 
 
 def test_a_lit_drogue_has_no_pose_and_says_why() -> None:
