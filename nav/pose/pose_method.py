@@ -205,6 +205,8 @@ _LEAST_PAIRS = 3
 _COLLINEAR_FRACTION = 0.02
 # Measurements from elsewhere may lie outside the image, but by no more than its size.
 _OUTSIDE_IMAGES = 1.0
+# Largest difference of a covariance's two mixed entries, over the root of the variances' product: rounding.
+_ASYMMETRY = 1e-6
 # A ring tilted by 60 degrees appears a quarter smaller on average; the rest allows for noise at long range.
 _RIG_MISMATCH_FRACTION, _RIG_MISMATCH_PX = 0.35, 1.0
 
@@ -257,10 +259,12 @@ def _invalid_numbers(
         a, b, c, d = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
         determinant = a * d - b * c
         sound = (a > 0) & (determinant > 0) & np.isfinite(determinant + a + b + c + d)
-    unsound = seen & ~sound
-    if unsound.any():
-        eye, index = np.argwhere(unsound)[0].tolist()
-        return NoFixReason(f"{what} {index} of the {EYES[first_eye + eye]} eye has no positive covariance")
+        symmetric = np.abs(b - c) <= _ASYMMETRY * np.sqrt(a * d)
+    for good, kind in ((sound, "positive"), (symmetric, "symmetric")):
+        bad = seen & ~good
+        if bad.any():
+            eye, index = np.argwhere(bad)[0].tolist()
+            return NoFixReason(f"{what} {index} of the {EYES[first_eye + eye]} eye has no {kind} covariance")
     return None
 
 

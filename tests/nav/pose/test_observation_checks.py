@@ -131,6 +131,10 @@ def not_a_number(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: 
     cov[0, 2, 0, 0] = np.nan
 
 
+def asymmetric(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
+    cov[0, 2] = [[0.01, 0.009], [-0.009, 0.01]]
+
+
 @pytest.mark.parametrize("method", MONO)
 @pytest.mark.parametrize(
     ("change", "reason"),
@@ -144,6 +148,7 @@ def not_a_number(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: 
         (infinite_right, "marker 5 of the right eye lies far outside"),
         (huge_covariance, "marker 2 of the left eye has no positive covariance"),
         (not_a_number, "marker 2 of the left eye has no positive covariance"),
+        (asymmetric, "marker 2 of the left eye has no symmetric covariance"),
     ],
 )
 def test_reasons_of_monocular_methods(draws: Draws, method: str, change: Callable[..., Any], reason: str) -> None:
@@ -216,6 +221,12 @@ def test_reasons_of_a_bad_hub(draws: Draws, method: str) -> None:
     def no_covariance(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         hub_cov[0, 1] = 0
 
+    def skew_covariance(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
+        hub_cov[0, 1, 0, 1] = 0.002
+
+    assert "hub edge 1 of the left eye has no symmetric covariance" in reason_of(
+        method, changed(draws, skew_covariance)
+    )
     assert "hub edge 0 of the right eye lies far outside" in reason_of(method, changed(draws, far_away))
     assert "hub edge 1 of the left eye has no positive covariance" in reason_of(method, changed(draws, no_covariance))
 
