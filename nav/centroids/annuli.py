@@ -357,7 +357,7 @@ def _weighted_fit(
 
     Args:
         pixels, harmonics: of the annuli.
-        shape: start and ties, see `all_parameters`.
+        shape: start and ties, see `expand_parameters`.
         model: in the free parameters.
         first: fit of equal weights.
         is_still: whether edges are so sharp that the pixels' response shows.

@@ -134,7 +134,7 @@ def pixels_on_face(
     """The pixels without those that get too much light from beyond the face.
 
     Args:
-        face, discs, pixels, motions: see `shares_beyond`.
+        face, discs, pixels, motions: see `background_shares`.
         further: from there.
         signal: one of those that the pixels are from.
     """

@@ -34,7 +34,6 @@ class FilterState:
         covariance: (12, 12) of pose, velocity and rate in this order, in the tangent of
             `datasets_manifest.types.estimates`. [m, rad, m/s, rad/s]
         modes: the poses of all hypotheses, the most likely first.
-        coasted_s: time since the last measurement. [s]
         motion_known: whether more than one measurement shows the motion; else velocity and rate are those assumed.
     """
 
@@ -44,7 +43,6 @@ class FilterState:
     rate_rad_s: Array
     covariance: Array
     modes: tuple[Mode, ...] = ()
-    coasted_s: float = 0.0
     motion_known: bool = True
 
     def __post_init__(self) -> None:
@@ -79,7 +77,7 @@ class FilterState:
         return estimate.model_copy(update={name: getattr(measured, name) for name in _MEASURED_FIELDS})
 
 
-def summarize_bank(bank: Bank, time_s: float, coasted_s: float, measurements: int) -> FilterState:
+def summarize_bank(bank: Bank, time_s: float, measurements: int) -> FilterState:
     """The most likely hypothesis of so many measurements; its covariance is the mixture's second moment about it."""
     best = bank[0].state
     return FilterState(
@@ -89,7 +87,6 @@ def summarize_bank(bank: Bank, time_s: float, coasted_s: float, measurements: in
         rate_rad_s=best.rate_rad_s,
         covariance=bank_covariance(bank),
         modes=_modes(bank),
-        coasted_s=coasted_s,
         motion_known=measurements > 1,
     )
 
@@ -212,7 +209,7 @@ def predict(tracker_state: TrackerState, time_s: float, settings: FilterSettings
         return None
     # Most calls ask for the time of the last measurement, which needs no propagation.
     bank = propagate_bank(track.bank, coasted_s, settings) if coasted_s > 0 else track.bank
-    return summarize_bank(bank, time_s, coasted_s, track.measurements)
+    return summarize_bank(bank, time_s, track.measurements)
 
 
 def _start_track(time_s: float, measurement: PoseMeasurement, settings: FilterSettings) -> Track:

@@ -56,8 +56,7 @@ def smooth(
         }
         banks = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
         for index, bank in enumerate(_backward_pass(banks), start=first):
-            coasted_s = float(np.abs(times[members] - times[index]).min())
-            state = summarize_bank(bank, float(times[index]), coasted_s, len(members))
+            state = summarize_bank(bank, float(times[index]), len(members))
             estimate = estimates[index]
             smoothed[index] = state.to_estimate(estimate.frame_index, _name(estimate), estimate)
     return smoothed

@@ -26,8 +26,6 @@ _SIGMA_PX = 0.58
 _INNERMOST, _OUTERMOST = 0.75, 1.45
 _STEPS, _SMALL_STEP_PX = 12, 0.003
 _LARGEST_STEP_PX = 1.5
-# The sky's level and its two slopes.
-_SKY_TERMS = 3
 # Turns that are tried lie this far apart on the ring of lamps. [px]
 _TURN_STEP_PX = 0.5
 # All lamps together, in standard deviations: turns of the picture of a face without lamps reach five.

@@ -31,7 +31,7 @@ def points_in_eyes(rig: StereoRig, centers_m: Array, rotations: Array, translati
 
 
 def project_markers(rig: StereoRig, layout: MarkerLayout, rotations: Array, translations_m: Array) -> Array:
-    """(S, 2, N, 2) centres of the markers' image ellipses in both eyes; arguments as for `eye_points`. [px]"""
+    """(S, 2, N, 2) centres of the markers' image ellipses in both eyes; arguments as for `points_in_eyes`. [px]"""
     points = points_in_eyes(rig, layout.centers_m, rotations, translations_m)
     normals = np.broadcast_to(rotations[:, None, None, :, 2], points.shape)
     return rig.camera.project(ellipse_center_points(points, normals, layout.radius_m))
