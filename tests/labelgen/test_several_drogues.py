@@ -18,6 +18,7 @@ from droguekit.scoring.detection.detection_truth import read_detection_truth
 from droguekit.scoring.results.detection_result import DetectedBox
 from geometry.stereo import EYES
 from labelgen.export.annotations.coco import DROGUE, write_coco
+from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.annotations.yolo import write_yolo_detect
 from labelgen.export.export_log import ExportLog
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
@@ -119,6 +120,20 @@ def test_pycocotools_reads_several_drogues_an_image(dataset: Path, tmp_path: Pat
         pairs += len(shown) == 2
     assert pairs >= 4
     assert len(coco.anns) == len(json.loads((tmp_path / "all.json").read_text())["annotations"])
+
+
+def test_keypoints_are_aligned_with_those_of_the_sought_one(dataset: Path, tmp_path: Path) -> None:
+    write_coco(dataset, tmp_path, ExportLog())
+    with contextlib.redirect_stdout(io.StringIO()):
+        coco = COCO(str(tmp_path / "all.json"))
+    sought = [entry for entry in coco.anns.values() if entry["droguekit"].get("sought")]
+    assert len(sought) < sum(entry["category_id"] == DROGUE for entry in coco.anns.values())
+    turned = [
+        {"image_id": entry["image_id"], "keypoints": entry["keypoints"][9:] + entry["keypoints"][:9]}
+        for entry in sought
+    ]
+    aligned = align_keypoint_orders(coco, turned)
+    assert [result["keypoints"] for result in aligned] == [entry["keypoints"] for entry in sought]
 
 
 def test_yolo_has_a_row_for_each(dataset: Path, tmp_path: Path) -> None:

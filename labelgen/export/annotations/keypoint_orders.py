@@ -9,7 +9,7 @@ import numpy as np
 from pycocotools.coco import COCO
 
 from geometry.se3 import Array
-from labelgen.export.annotations.coco import DROGUE, NAMESPACE
+from labelgen.export.annotations.coco import NAMESPACE
 
 
 def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -17,20 +17,23 @@ def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> lis
 
     An evenly spaced ring of eight looks the same after each of eight turns, so a detector may begin with any marker.
     The order with the smallest sum of squared distances is taken; orders that are not a turn of the drogue, such as the
-    mirrored one, remain errors.
+    mirrored one, remain errors. Drogues beside the sought one have no keypoints and are passed over.
 
     Args:
         truth: a file of `write_coco` or a dataset's `annotations`.
         results: as for `COCO.loadRes`, with `keypoints` in any of the symmetric orders, such as that in the image.
 
     Returns:
-        Copies of the results; those on images without a drogue are unchanged.
+        Copies of the results; those on images without the sought drogue are unchanged.
 
     Raises:
         ValueError: a result with another number of keypoints than the truth has.
     """
     return [
-        _best_roll(result, [entry for entry in truth.imgToAnns[result["image_id"]] if entry["category_id"] == DROGUE])
+        _best_roll(
+            result,
+            [entry for entry in truth.imgToAnns[result["image_id"]] if "equal_keypoint_orders" in entry[NAMESPACE]],
+        )
         for result in results
     ]
 
