@@ -130,7 +130,8 @@ class _Bag:
 @contextmanager
 def _open_bag(path: Path, rig: StereoRig, start_ns: int) -> Iterator[_Bag]:
     """A new bag with the fixed transforms."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    # Humble reads no newer form of metadata; later releases read this one.
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         bag = _Bag(writer)
         bag.write("/tf_static", transforms_message(fixed_transforms(rig), start_ns), start_ns)
         yield bag

@@ -137,6 +137,20 @@ def test_metadata_counts_what_the_file_holds(bag: Messages, tmp_path: Path) -> N
     assert counts == {topic: len(messages) for topic, messages in bag.items()}
 
 
+def test_metadata_have_the_form_of_humble(bag: Messages, tmp_path: Path) -> None:
+    told = yaml.safe_load((tmp_path / "bags" / "single_pairs" / "metadata.yaml").read_text())
+    topics = [entry["topic_metadata"] for entry in told["rosbag2_bagfile_information"]["topics_with_message_count"]]
+    assert {topic["name"] for topic in topics} == set(bag)
+    for topic in topics:
+        # Humble reads a text, and in it the numbers of ROS's middleware.
+        text = topic["offered_qos_profiles"]
+        assert isinstance(text, str)
+        (profile,) = yaml.safe_load(text)
+        assert (profile["history"], profile["reliability"]) == (1, 1)
+        assert profile["durability"] == (1 if topic["name"] == "/tf_static" else 2)
+    assert run(["import", str(tmp_path / "bags" / "single_pairs"), "--out", str(tmp_path / "imported")]) == DONE
+
+
 def test_the_same_dataset_gives_the_same_bytes(small_dataset: Path, tmp_path: Path) -> None:
     log = ExportLog()
     for name in ("one", "two"):
