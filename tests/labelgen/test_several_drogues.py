@@ -21,6 +21,7 @@ from labelgen.export.annotations.coco import DROGUE, write_coco
 from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.annotations.yolo import write_yolo_detect
 from labelgen.export.export_log import ExportLog
+from labelgen.export.packages.huggingface import write_huggingface
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
 from labelgen.validation.dataset_checks import validate_dataset
 from studies.detector_comparison.peer_corpus import export_corpus
@@ -146,6 +147,15 @@ def test_yolo_has_a_row_for_each(dataset: Path, tmp_path: Path) -> None:
             part_id = source.part_ids(index, eye)
             shown = sum(bool(np.isin(part_id, drogue_part_ids(8, k)).any()) for k in (0, 1))
             assert sum(row[0] == "0" for row in rows) == shown
+
+
+def test_hugging_faces_card_names_their_parts_and_the_log_counts_them(dataset: Path, tmp_path: Path) -> None:
+    log = ExportLog()
+    write_huggingface(dataset, tmp_path / "hub", log)
+    assert log.losses["drogues beside the sought one: left out of the objects"] == len(Dataset(dataset).frame_indices)
+    card = (tmp_path / "hub" / "README.md").read_text(encoding="utf-8")
+    assert f"{int(Part.HOSE)} hose" in card
+    assert f"Those of a second drogue and its hose are {INSTANCE_STEP} higher, those of a third 128." in card
 
 
 def test_networks_of_others_learn_all_of_them(dataset: Path, tmp_path: Path) -> None:

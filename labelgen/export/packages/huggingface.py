@@ -23,7 +23,7 @@ from datasets_manifest.storage.layout import CALIBRATION_FOLDER, CARD_FILE, MANI
 from datasets_manifest.storage.manifest import Manifest, SplitName
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
-from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP, Part, part_name
 from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import DISPLAY_REMARK
 from labelgen.export.packages.huggingface_columns import HubColumn, arrow_type, hub_columns, hub_row, yaml_feature
@@ -247,7 +247,10 @@ def hub_card(manifest: Manifest, columns: dict[str, HubColumn], sizes: list[Spli
 
 def _parts_line() -> str:
     named = ", ".join(f"{int(part)} {part_name(part)}" for part in Part)
-    return f"{named}, and {FIRST_MARKER_ID} + i marker i"
+    return (
+        f"{named}, and {FIRST_MARKER_ID} + i marker i. Those of a second drogue and its hose are {INSTANCE_STEP} "
+        f"higher, those of a third {2 * INSTANCE_STEP}"
+    )
 
 
 def _notes(manifest: Manifest) -> list[str]:

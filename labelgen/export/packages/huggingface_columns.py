@@ -170,11 +170,12 @@ def yaml_feature(feature: Feature) -> dict[str, Any]:
 
 
 def hub_row(source: Dataset, record: PairRecord, split: str, log: ExportLog) -> dict[str, Any]:
-    """One pair, by column.
+    """One pair, by column; the log counts what it has no column for.
 
     Raises:
         ValueError: an image, part ids or passes that cannot be read; names the file.
     """
+    log.lost("drogues beside the sought one: left out of the objects", len(record.frame.neighbours))
     recipe, index = source.manifest.recipe, record.frame_index
     row: dict[str, Any] = {
         "frame_index": index,
