@@ -57,10 +57,11 @@ baseline_m = {baseline:.15g}
 # 8, or 12 in files of 16 bits, which most viewers show as black; `droguekit preview` shows them.
 output_bits = {bits}
 
+# This table replaces that of the preset: a key that is left out has its default.
 [optics]
-pixel_pitch_um = 3.75
+{optics}
 
-# Real lenses: Brown-Conrady coefficients. Without this table the lenses are ideal.
+# Real lenses: Brown-Conrady coefficients. Without this table the lenses are {lenses}.
 # [eyes]
 # k1 = -0.12
 # k2 = 0.05
@@ -180,6 +181,8 @@ def _rig_text(out: Path, choices: FileChoices) -> str:
     width, _, height = choices.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise ValueError(f"--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {choices.size!r}")
+    rig, sensor = resolve_rig(choices.preset)
+    optics = sensor.optics.model_dump(exclude_defaults=True) | {"pixel_pitch_um": sensor.optics.pixel_pitch_um}
     return _RIG.format(
         file=out.name,
         preset=_text(choices.preset),
@@ -188,6 +191,8 @@ def _rig_text(out: Path, choices: FileChoices) -> str:
         focal=choices.focal_px,
         baseline=choices.baseline_m,
         bits=choices.bits,
+        optics="\n".join(f"{key} = {json.dumps(value)}" for key, value in optics.items()),
+        lenses="ideal" if rig.lenses is None else "those of the preset",
     )
 
 

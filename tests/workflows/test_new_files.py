@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.rigs import SENSORS, load_rig, resolve_rig
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 
 
@@ -26,6 +27,24 @@ def test_a_recipe_of_a_new_drogue_and_a_new_rig(tmp_path: Path, monkeypatch: pyt
     assert np.isclose(read.rig.camera.fx_px, 1739.13)
     assert read.sensor.output_bits == 12
     assert (read.distance.low_m, read.distance.high_m, read.frames.count) == (5, 60, 20)
+
+
+@pytest.mark.parametrize("preset", SENSORS)
+def test_a_new_rig_is_the_preset(preset: str, tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    assert run(["new", "rig", "--preset", preset, "--focal-px", "2133.333333333333", "--out", str(out)]) == DONE
+    rig, sensor = resolve_rig(load_rig(str(out)))
+    wanted_rig, wanted_sensor = resolve_rig(preset)
+    assert sensor == wanted_sensor
+    assert (rig.baseline_m, rig.camera.width_px, rig.camera.cy_px) == (0.12, 1280, 479.5)
+    # By the digits of the focal length.
+    assert rig.camera.fx_px == pytest.approx(wanted_rig.camera.fx_px, rel=1e-14)
+    assert (rig.lenses is None) == (wanted_rig.lenses is None)
+    for lens, wanted in zip(rig.lenses or (), wanted_rig.lenses or (), strict=True):
+        assert lens.distortion == wanted.distortion
+        np.testing.assert_array_equal(lens.ideal_from_real, wanted.ideal_from_real)
+    ideal = "Without this table the lenses are ideal."
+    assert (ideal in out.read_text()) == (wanted_rig.lenses is None)
 
 
 @pytest.mark.parametrize(
