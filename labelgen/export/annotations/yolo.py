@@ -118,11 +118,15 @@ def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bo
 
 
 def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[str, ...]) -> list[Path]:
-    splits = source.manifest.split_of_frame()
+    split_of_frame = source.manifest.split_of_frame()
+    # Not those of the manifest: all pairs of a split may be damaged.
+    splits: set[str] = set()
     with new_folder(out) as folder:
         for record in log.records(source):
+            split = split_of_frame[record.frame_index]
+            splits.add(split)
             for eye in EYES:
-                place = f"{splits[record.frame_index]}/{record.frame_index:06d}_{eye}"
+                place = f"{split}/{record.frame_index:06d}_{eye}"
                 export_image(source, record.frame_index, eye, folder / "images" / f"{place}.png", log)
                 label = folder / "labels" / f"{place}.txt"
                 label.parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +138,7 @@ def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[
             f"# droguekit dataset {source.manifest.name}, sha256 {source.manifest.dataset_sha256}",
             "# An empty path is the folder of this file.",
             'path: ""',
-            *_split_lines(set(splits.values()), log),
+            *_split_lines(splits, log),
             *lines,
             "names:",
             *(f"  {number}: {name}" for number, name in enumerate(names)),
@@ -144,14 +148,14 @@ def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[
 
 
 def _split_lines(splits: set[str], log: ExportLog) -> list[str]:
-    """The folders of the splits; ultralytics needs the first two, even if the dataset has no pairs for them."""
+    """The folders of the splits; ultralytics needs the first two, even if there are no pairs of them."""
     lines = []
     for split in ("train", "val", "test"):
         if split in splits:
             lines.append(f"{split}: images/{split}")
         elif split != "test" and splits:
             other = next(name for name in ("train", "val", "test") if name in splits)
-            lines.append(f"{split}: images/{other}  # the dataset has no pairs for {split}")
+            lines.append(f"{split}: images/{other}  # there are no pairs for {split}")
             log.lost(f"splits without pairs: data.yaml names images/{other} for {split}")
     return lines
 

@@ -72,7 +72,8 @@ def write_huggingface(dataset: Location, out: Path, log: ExportLog, shard_bytes:
             for record in log.records(source):
                 split = split_of_frame[record.frame_index]
                 writers[split].add(hub_row(source, record, split, log))
-        sizes = [writers[split].size() for split in present]
+        # Of a split all of whose pairs are damaged there is no file.
+        sizes = [size for split in present if (size := writers[split].size()).rows]
         (folder / CARD_FILE).write_text(hub_card(manifest, columns, sizes), encoding="utf-8", newline="\n")
         for name in (MANIFEST_FILE, RECIPE_FILE):
             if storage.exists(name):

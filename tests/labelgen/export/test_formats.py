@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.pair_faults import PairFaults
+from datasets_manifest.storage.reader import Dataset
 from droguekit.cli.main import WRONG_INPUT, run
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
@@ -197,6 +199,22 @@ def test_a_damaged_pair_is_left_out_and_counted(name: str, mixed_dataset: Path, 
     assert faults.count == 1 and faults.first[0] == int(first.name)
     assert re.search(r"record\.json: is truncated", faults.first[1])
     assert tree(tmp_path / "out")
+
+
+def test_a_split_without_a_whole_pair_is_not_named(mixed_dataset: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
+    for index, split in Dataset(copy).manifest.split_of_frame().items():
+        if split == "val":
+            (copy / "frames" / f"{index:06d}" / "record.json").write_text("{")
+    for name in ("yolo", "huggingface"):
+        write_export(name, copy, tmp_path / name, ExportLog(faults=PairFaults()))
+    table = yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())
+    assert (table["train"], table["val"], table["test"]) == ("images/train", "images/train", "images/test")
+    front = yaml.safe_load((tmp_path / "huggingface" / "README.md").read_text(encoding="utf-8").split("---\n", 2)[1])
+    files = [entry["path"] for entry in front["configs"][0]["data_files"]]
+    assert files == ["data/train-*.parquet", "data/test-*.parquet"]
+    assert all(any((tmp_path / "huggingface").glob(path)) for path in files)
+    assert [split["name"] for split in front["dataset_info"]["splits"]] == ["train", "test"]
 
 
 def test_a_pair_with_a_changed_image_is_no_half_pair_in_an_export(mixed_dataset: Path, tmp_path: Path) -> None:
