@@ -194,13 +194,13 @@ class _BlindSource:
 
 
 class StereoDataset(Sequence[StereoPair]):
-    """Stereo pairs in the order of their frame indices.
+    """Stereo pairs, in ascending order of their frame indices or in the order of the selection.
 
     A dataset is small to pickle, so that data loaders may send it to their processes.
 
     Attributes:
         path: folder or URL.
-        frame_indices: of the pairs, ascending.
+        frame_indices: of the pairs, in ascending order, or in the order of the selection.
     """
 
     def __init__(self, path: str | Path, frame_indices: Collection[int] | None = None) -> None:
