@@ -288,12 +288,14 @@ def _with_times(pairs: list[tuple[Path, Path]], rests: dict[Path, str], rate_hz:
             order = sorted(range(len(whole)), key=times_ns.__getitem__)
             times_s = [1e-9 * times_ns[place] for place in order]
             return FolderPairs([whole[place] for place in order], times_s, source, left_out)
-        rate_hz = _RATE_HZ
+        rate_hz, source = _RATE_HZ, f"{_RATE_HZ:g} pairs a second; assumed, without --rate"
+    else:
+        source = f"{rate_hz:g} pairs a second (--rate)"
     alone = rests.keys() - {path for pair in pairs for path in pair}
     every = sorted([*pairs, *((path, path) for path in alone)], key=lambda pair: _in_number_order(rests[pair[0]]))
     places = [place for place, pair in enumerate(every) if used.issuperset(pair)]
     ordered, times_s = [every[place] for place in places], [place / rate_hz for place in places]
-    return FolderPairs(ordered, times_s, f"{rate_hz:g} pairs a second (--rate)", left_out)
+    return FolderPairs(ordered, times_s, source, left_out)
 
 
 def _file_fault(path: Path) -> str | None:

@@ -74,7 +74,8 @@ def import_(
         typer.Option(
             "--rate",
             metavar="HZ",
-            help="Pairs per second in a folder; by default the time stamps in file names, else 25.",
+            help="Pairs per second in a folder; by default the time stamps in file names, else a list timestamps.txt "
+            "or times.txt, else 25.",
             show_default=False,
         ),
     ] = None,

@@ -154,15 +154,16 @@ def test_a_bag_in_a_folder_is_found(smoke_dataset: Path, tmp_path: Path, capsys:
 def test_what_pixel_values_were_taken_for_is_said(
     smoke_dataset: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(arguments(pictures, smoke_dataset, tmp_path / "said")) == DONE
+    assert run([*arguments(pictures, smoke_dataset, tmp_path / "said"), "--rate", "25"]) == DONE
     said = capsys.readouterr()
     assert "pixel values: 8 bits, linear, black level" in said.err + said.out
+    assert "times: 25 pairs a second (--rate)" in said.err + said.out
     assert "assumed" not in said.err + said.out
     calibration = str(smoke_dataset / "calibration" / "opencv_stereo.yaml")
     assert run(["import", str(pictures), "--out", str(tmp_path / "unsaid"), "--calibration", calibration]) == DONE
     said = capsys.readouterr()
     line = "pixel values: 8 bits, gamma, black level 0 DN; assumed, without --encoding, --black-level"
-    assert line in said.err + said.out and "times: 25 pairs a second (--rate)" in said.err + said.out
+    assert line in said.err + said.out and "times: 25 pairs a second; assumed, without --rate" in said.err + said.out
     (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
     assert run(["import", str(bag), "--out", str(tmp_path / "bag")]) == DONE
     said = capsys.readouterr()

@@ -156,8 +156,10 @@ def test_time_stamps_in_names_are_the_times(form: Callable[[int], str], resoluti
     "name", ["0000000005", "20240131_120000", "5", "frame1403636579", "1403636579763555584-1403636579813555456"]
 )
 def test_counters_and_dates_are_no_time_stamps(name: str, tmp_path: Path) -> None:
-    found = find_pairs(touch(tmp_path, f"left/{name}.png", f"right/{name}.png"))
-    assert found.times_s == [0.0] and found.times_from == "25 pairs a second (--rate)"
+    folder = touch(tmp_path, f"left/{name}.png", f"right/{name}.png")
+    found = find_pairs(folder)
+    assert found.times_s == [0.0] and found.times_from == "25 pairs a second; assumed, without --rate"
+    assert find_pairs(folder, 25.0).times_from == "25 pairs a second (--rate)"
 
 
 def test_time_stamps_of_a_pair_may_differ_within_the_tolerance(tmp_path: Path) -> None:
