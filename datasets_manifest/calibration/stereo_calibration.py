@@ -118,8 +118,17 @@ def calibrated_lens(camera: PinholeCamera, distortion: BrownConrady, ideal_from_
     """A camera with its lens; `name` is that of the coefficients, with their file, and begins the error.
 
     Raises:
-        ValueError: the distortion folds the image.
+        ValueError: the distortion folds the image, or the eye is turned too far.
     """
+    try:
+        # Numbers beyond all measure overflow before they are refused.
+        with np.errstate(all="ignore"):
+            Lens(camera, distortion)
+    except ValueError as error:
+        raise ValueError(
+            f"{name}: {distortion.coefficients().tolist()} fold the image of {camera.width_px}x{camera.height_px} px: "
+            "are they of cv2.fisheye, or of another image size? calibrate again"
+        ) from error
     try:
         return Lens(camera, distortion, ideal_from_real)
     except ValueError as error:
