@@ -23,7 +23,15 @@ from datasets_manifest.storage.frame_store import (
     shard_numbers,
 )
 from datasets_manifest.storage.image_codecs import decode_png
-from datasets_manifest.storage.layout import CALIBRATION_FOLDER, RECORD_FILE, parts_file, shard_file, shard_index_file
+from datasets_manifest.storage.layout import (
+    BLIND_FILE,
+    CALIBRATION_FOLDER,
+    MANIFEST_FILE,
+    RECORD_FILE,
+    parts_file,
+    shard_file,
+    shard_index_file,
+)
 from datasets_manifest.storage.manifest import FrameEntry, Manifest, count_pairs
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, Storage, open_storage
@@ -129,12 +137,14 @@ def validate_dataset(path: Location) -> ValidationReport:
         All checks with their faults; damaged files are faults, not exceptions.
 
     Raises:
-        ValueError: there is no such folder, or a URL that cannot be used.
+        ValueError: there is no such folder, a dataset that never had labels, or a URL that cannot be used.
         OSError: a location that cannot be reached.
     """
     storage = open_storage(path)
     if not storage.root_exists():
         raise ValueError(f"{path}: there is no such dataset folder")
+    if storage.exists(BLIND_FILE) and not storage.exists(MANIFEST_FILE):
+        raise ValueError(f"{path}: is a blind or imported dataset, which has no labels to check")
     tally = _Tally()
     try:
         dataset = Dataset(path)

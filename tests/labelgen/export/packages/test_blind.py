@@ -79,6 +79,9 @@ def test_navigate_runs_on_it_and_what_needs_the_truth_says_so(
     capsys.readouterr()
     assert run(["export", str(blind), "--format", "coco", "--out", str(tmp_path / "coco")]) == WRONG_INPUT
     assert "is a blind dataset, which has no truth" in capsys.readouterr().err
+    # Nothing is wrong with it, so it is wrong input and no fault.
+    assert run(["validate", str(blind)]) == WRONG_INPUT
+    assert "is a blind or imported dataset, which has no labels to check" in capsys.readouterr().err
 
 
 def test_only_what_is_needed_is_there(blind: Path) -> None:
