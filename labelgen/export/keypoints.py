@@ -39,9 +39,7 @@ ABSENT = Keypoint(0.0, 0.0, 0)
 
 def keypoint_count(manifest: Manifest) -> int:
     """Number of keypoints of every drogue in a dataset's exports: the largest number of markers, at least 8."""
-    recipe = manifest.recipe
-    counts = [recipe.drogue.marker_count, *(variant.drogue.marker_count for variant in recipe.variants)]
-    return max(MIN_KEYPOINTS, *counts)
+    return max(MIN_KEYPOINTS, *(drogue.marker_count for drogue in manifest.recipe.drogues))
 
 
 def view_of(record: PairRecord, eye: Eye) -> ViewRecord:

@@ -16,7 +16,7 @@ from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
-from labelgen.export.annotations.coco import DROGUE, HUB, MARKER, coco_image_id, write_coco
+from labelgen.export.annotations.coco import DROGUE, HUB, MARKER, coco_header, coco_image_id, write_coco
 from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import symmetric_orders
@@ -73,6 +73,21 @@ def test_truth_against_itself_is_perfect(truth: Any) -> None:
     assert average_precision(truth, results_of(truth, "segmentation"), "segm") == pytest.approx(1, abs=1e-12)
     own = keypoint_results(truth, lambda extra: list(range(len(extra["visible_fraction"]))))
     assert average_precision(truth, own, "keypoints") == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("is_shown", [False, True])
+def test_only_drogues_that_are_shown_have_keypoints(is_shown: bool, mixed_dataset: Path) -> None:
+    manifest = Dataset(mixed_dataset).manifest
+    angles = 2 * np.pi * np.arange(12) / 12
+    ring = tuple((0.25 * np.cos(angle), 0.25 * np.sin(angle)) for angle in angles)
+    twelve = PRESETS["red-8"].model_copy(update={"marker_positions_m": ring})
+    # The mixed dataset's variants, of eight, five and seven markers, take the place of the recipe's own drogue.
+    changes: dict[str, Any] = {"drogue": twelve}
+    if is_shown:
+        changes["target"] = manifest.recipe.target.model_copy(update={"variants": ()})
+    shown = manifest.model_copy(update={"recipe": manifest.recipe.model_copy(update=changes)})
+    category, *_ = coco_header(shown, with_features=False)["categories"]
+    assert len(category["keypoints"]) == (12 if is_shown else 8)
 
 
 def test_keypoints_in_the_image_order_are_perfect_up_to_a_turn(truth: Any) -> None:
