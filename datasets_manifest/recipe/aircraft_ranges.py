@@ -49,7 +49,7 @@ class TankerVariant(FrozenModel):
 
     Attributes:
         type: planform.
-        station: where the hose leaves; None for all of the type in equal shares.
+        station: where the hose leaves; without it, all stations of the type have equal shares.
         weight: its share of the scenes, relative to the other variants' weights.
         paints: to choose from; empty for the section's, or for the usual ones of the type.
     """
@@ -237,8 +237,8 @@ class ReceiverRanges(FrozenModel):
     `tip_fraction` and `jitter_m` do not apply.
 
     Attributes:
-        probes: forms to choose from with equal probability, see `drogue_models.surroundings.bystanders`, or `none`; one
-            may be listed several times.
+        probes: forms to choose from with equal probability, or `none`; one may be listed several times. The page on
+            [surroundings](surroundings.md#receiver) shows what each is.
         sides: to choose from with equal probability, except that `probe-nose` is always at the centre. The rig's
             `probe_tip_body_m` gives the distances from the middle; at the centre that to the side is 0.
         tip_fraction: factors on the tip's distances to the side and down, each drawn. Receivers differ in them.

@@ -21,8 +21,8 @@ class DistanceLaw(FrozenModel):
             `stations`, which takes the values of `stations_m` in turn, frame by frame.
         low_m, high_m: the law's ends; for all but `stations`. [m]
         stations_m: distances; for `stations` alone. [m]
-        edges_m: ascending distances from `low_m` to `high_m`, the ends of bins within each of which the law holds; None
-            for the law from end to end. [m]
+        edges_m: ascending distances from `low_m` to `high_m`, the ends of bins within each of which the law holds;
+            without them it holds from end to end. [m]
         weights: share of the frames in each bin, relative to the others; one fewer than `edges_m`.
     """
 
@@ -148,7 +148,7 @@ class AppearanceRanges(FrozenModel):
         failed_lamp_fraction: probability that a self-lit marker is out.
         lamp_fraction: luminance of the other lamps, as a share of the drogue's.
         body_reflectance_fraction: see `DrogueCondition`.
-        wear: of the drogue's paint, cloth and metal, drawn with the rest of its condition; None for even paint.
+        wear: of the drogue's paint, cloth and metal, drawn with the rest of its condition; without it paint is even.
         probe: whether the receiver's probe is drawn, with its tip at the rig's `probe_tip_body_m`.
         probe_radius_m: of its tube. [m]
         obstacle_frame_fraction: share of frames in which a bar close to the cameras may hide part of the drogue.

@@ -114,7 +114,7 @@ class EnvironmentRanges(FrozenModel):
         mist, moon: with the share of the scenes that have them.
         map: an image of sky and ground, which replaces all of the above but the visibility; in TOML the path of a file
             in absolute units, or a table with `file` and the other keys of `EnvironmentMapRanges`.
-        sky_model: see `Environment`; not drawn.
+        sky_model: see `Environment`. All scenes have the one given.
     """
 
     sun_elevation_deg: Range = Range(low=15, high=65)
