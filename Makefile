@@ -91,7 +91,7 @@ bench-detectors: ## detectors OURS=FILE.onnx beside seven of other projects, tra
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
-detector-weights: ## make the shipped mobile-l anew: photographs, corpora, three trainings, scores (hours; Debian 12; NVIDIA GPU; resumes)
+detector-weights: ## make the shipped mobile-l anew: photographs, corpora, five trainings, scores (hours; Debian 12; NVIDIA GPU; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_weights --out out/detector-weights
 
