@@ -195,8 +195,8 @@ class HoseRanges(FrozenModel):
 class NeighbourRanges(FrozenModel):
     """Distribution of second drogues, of the scene's own kind, with hoses as `[hose]` has them.
 
-    The second drogue hangs behind another tanker that flies ahead and beside, on the same heading. It is farther away
-    than the one that is sought, and does not lie behind it in the image.
+    The second drogue hangs from another station of the first tanker, if that is the plain wing, or behind another
+    tanker on the same heading. It is farther away than the one that is sought, and does not lie behind it in the image.
 
     Attributes:
         scene_fraction: share of scenes with a second drogue in view.

@@ -31,7 +31,7 @@ SMALLEST_LEARNED_FRACTION = 0.018
 
 Views are drawn for an image's first drogue; those beside it may become too small to tell them from anything else.
 """
-# Of an image's first drogue: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.5 and 11 px.
+# Of an image's first drogue: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.6 and 11 px.
 _SMALLEST_BOX_FRACTION = 0.027
 _LARGEST_BOX_FRACTION = 1.2  # longer side over the window's shorter one; larger boxes are mostly cut off
 _SHIFT_FRACTION = 0.9  # of the range in which the crop can move while it contains the drogue's centre

@@ -26,7 +26,7 @@ from geometry.stereo import EYES, Eye
 # A box of which at least this share lies in an ignored drogue's box belongs to it, unless it overlaps one that is to be
 # found by as much: COCO's rules for crowds at IoU 0.5.
 _LEAST_SHARE_INSIDE = _LEAST_OVERLAP = 0.5
-# Longer side of another tanker's drogue over the image's height. The seed paper's camera sees 0.036 of it at 40 m, the
+# Longer side of another tanker's drogue over the image's height. The seed paper's camera sees 0.037 of it at 40 m, the
 # farthest that a drogue is sought.
 _LEAST_OTHER_SIDE_FRACTION = 0.025
 
