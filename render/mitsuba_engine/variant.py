@@ -293,4 +293,4 @@ def probe_variant(device: Device = "cpu") -> Variant:
             return Variant("llvm_ad_rgb", f"LLVM works: {library}", library)
     tried = ", ".join(str(library) for library in libraries)
     reason = f"no LLVM library works (tried {tried})" if libraries else f"no LLVM library >= {_OLDEST_LLVM} found"
-    return Variant("scalar_rgb", f"{reason}; about 3 times slower; {LLVM_REMEDY}")
+    return Variant("scalar_rgb", f"{reason}; several times slower; {LLVM_REMEDY}")

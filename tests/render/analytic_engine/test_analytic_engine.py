@@ -79,7 +79,7 @@ def lattice_centroid(disc: DiscInEye) -> tuple[np.ndarray, np.ndarray]:
 
     Within a pixel on the edge the light does not lie in the middle. By Poisson's summation formula, along each axis
     with centre c and half-extent w of the ellipse, the centroid is
-    `c + sum_k (-1)^k sin(2 pi k c) J1(2 pi k w) / (pi^2 k^2 w)`: 0.007 px at 2.7 px radius, falling as w^-1.5.
+    `c + sum_k (-1)^k sin(2 pi k c) J1(2 pi k w) / (pi^2 k^2 w)`. The sum is below 0.04 w^-1.5: 0.009 px at w = 2.7 px.
     """
     u_low, v_low, u_high, v_high = disc.extent_px()
     low, high = np.array([u_low, v_low]), np.array([u_high, v_high])
