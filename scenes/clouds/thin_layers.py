@@ -18,8 +18,11 @@ from scenes.clouds.ray_march import tile_at
 _Field = NDArray[np.float32]
 _BODY_SLOPE, _STRAND_SLOPE, _MIST_SLOPE = 2.6, 1.6, 2.2
 _RAIN_STEPS, _RAIN_REACH_M, _RAIN_LEAN = 24, 3e4, 0.35
-# Steps through mist, up to an optical depth behind which nothing is seen; patches are so many visibilities large.
-_MIST_STEPS, _MIST_DEPTH, _PATCH_PER_VISIBILITY, _LEAST_PATCH_M = 10, 6.0, 0.5, 60.0
+# At most so many steps through mist, up to an optical depth behind which nothing is seen; patches are so many
+# visibilities large. A step is so many patches long, far away so much of its distance: longer ones would miss what lies
+# between, and stripes would show where the ways of neighbouring rays are cut into other steps.
+_MIST_STEPS, _MIST_DEPTH, _PATCH_PER_VISIBILITY, _LEAST_PATCH_M = 48, 5.0, 0.5, 60.0
+_MIST_STEP, _MIST_GROWTH = 0.1, 0.15
 _PATCH_SHADE = 0.3
 # Cirrus covers a place with more than this of the layer's optical depth; places along a side that tell its cover.
 _ICE_EDGE, _ICE_SAMPLES = 0.1, 128
@@ -270,13 +273,13 @@ def _mist_depth(
     for index in range(rays.shape[0]):
         x, y, z = float(rays[index, 0]), float(rays[index, 1]), float(rays[index, 2])
         reach_m = (above_m if z > 0.0 else below_m) / max(abs(z), 1e-6)
-        far_m = min(reach_m, _MIST_DEPTH / extinction)
-        total, before, dense, weight = 0.0, 0.0, 0.0, 1e-6
-        for step in range(_MIST_STEPS):
-            share = (step + 1.0) / _MIST_STEPS
-            share *= share
-            at_m, length_m = 0.5 * (before + share) * far_m, (share - before) * far_m
-            before = share
+        start_m, total, dense, weight = 0.0, 0.0, 0.0, 1e-6
+        for _ in range(_MIST_STEPS):
+            if start_m >= reach_m or total > _MIST_DEPTH:
+                break
+            length_m = min(max(_MIST_STEP * size_m, _MIST_GROWTH * start_m), reach_m - start_m)
+            at_m = start_m + 0.5 * length_m
+            start_m += length_m
             u, v, h = (x * at_m + numbers[0]) / size_m, (y * at_m + numbers[1]) / size_m, z * at_m / size_m
             noise = tile_at(body, 64.0 * u + 31.0 * h, 64.0 * v + 9.0 * h)
             noise += 0.6 * tile_at(body, 210.0 * h, 70.0 * u + 25.0 * v) + 0.5 * tile_at(body, 200.0 * v, 200.0 * u)
@@ -287,7 +290,7 @@ def _mist_depth(
             dense += hides * noise * near
             weight += hides
             total += more
-        found[index, 0] = total + (reach_m - far_m) * extinction
+        found[index, 0] = total + (reach_m - start_m) * extinction
         found[index, 1] = dense / weight
 
 

@@ -90,7 +90,7 @@ class Ground:
         level = self._airfield or self._coast
         kept = None if level is None else level.hill_share
         self._terrain = Terrain(self._kind, environment.altitude_m, self._shift_m, self._is_round, kept)
-        self._is_low = environment.altitude_m < LOW_M and not self._terrain.is_level
+        self._has_cover = _has_cover(environment)
 
     @property
     def _is_round(self) -> bool:
@@ -105,7 +105,7 @@ class Ground:
         angle_rad = pixel_angle_rad(directions)
         if self._terrain.is_level or angle_rad > _COARSE_RAD:
             return None
-        cover = self._cover_m if self._is_low else None
+        cover = self._cover_m if self._has_cover else None
         return self._terrain.seen(directions, angle_rad, self._environment.camera_offset_m, cover)
 
     def radiance(
@@ -293,7 +293,7 @@ class Ground:
         shine = None
         if self._airfield is not None:
             albedo, sunlit = self._airfield.drawn_on(albedo, sunlit, view, self._cover.detail(view))
-        elif self._is_low and self._kind != "snow":
+        elif self._has_cover and self._kind != "snow":
             # Under a low camera there is no wood.
             share = self._clearing(view)
             dark = np.clip(2.0 - albedo.mean(axis=-1) / np.float32(0.035), 0.0, 1.0) if self._kind != "town" else share
@@ -306,7 +306,7 @@ class Ground:
             shine = np.float32(0.6) * self._coast.wetness(view, offshore_m) * fresnel(np.clip(view.sine, 0.03, 1.0))
         facing = self._beam_cosine(regions.slopes) * regions.sunny * sunlit
         sky = (light.sky_lux / np.pi).astype(np.float32)
-        if self._is_low and seen is not None:
+        if self._has_cover and seen is not None:
             facing, shade = self._on_sides(facing, view, seen)
             sky = sky * shade[..., None]
         result: Radiance = albedo * (facing[..., None] * (light.beam_lux / np.pi).astype(np.float32) + sky)
@@ -345,8 +345,16 @@ class Ground:
 
 def highest_land_sine(environment: Environment) -> float:
     """Sine of the elevation above which no land rises."""
-    is_low = environment.altitude_m < LOW_M
-    return highest_sine(environment.ground, environment.altitude_m, _TALLEST_M if is_low else 0.0)
+    cover_m = _TALLEST_M if _has_cover(environment) else 0.0
+    return highest_sine(environment.ground, environment.altitude_m, cover_m)
+
+
+def _has_cover(environment: Environment) -> bool:
+    """Whether trees and houses stand up before the camera.
+
+    None do on dry land: the heights of its textures are those of hummocks, which are seen by their shading.
+    """
+    return environment.ground not in ("sea", "dry") and environment.altitude_m < LOW_M
 
 
 def _open_share(layer: CloudLayer) -> float:

@@ -160,6 +160,18 @@ def test_trees_stand_above_the_horizon_of_a_low_camera() -> None:
         assert bool((met.share[directions[..., 2] > 0.002] > 0.5).any()) is expected
 
 
+def test_no_walls_stand_on_dry_land_below_a_low_camera() -> None:
+    """Dry hills slope by 0.13, and by three times as much in a hundred places: 20 degrees, a sine of 0.35.
+
+    With the heights of hummocks on them, as if they were trees, four of five rays met sides steeper than that.
+    """
+    met = Ground(environment("dry", altitude_m=60.0), light()).seen(rays(4.0))
+    assert met is not None
+    near = (met.distance_m < 1500.0) & (met.share == 1.0)
+    assert near.mean() > 0.3
+    assert np.mean(met.sine[near] > 0.4) < 0.01
+
+
 def test_clouds_shade_the_ground_and_keep_its_mean_light() -> None:
     layer = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=10.0,
                        texture_seed=1, thickness_m=300.0)  # fmt: skip
