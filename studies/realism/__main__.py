@@ -18,6 +18,7 @@ from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
 from studies.realism.blind_test import make_test, score
 from studies.realism.cloud_measures import cloud_table
+from studies.realism.cloud_sheet import write_cloud_sheet
 from studies.realism.ground_measures import ground_table
 from studies.realism.scene_variety import variety_table
 
@@ -163,6 +164,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parts.add_parser("sky", help="colours and luminances of the clear sky")
     clouds = parts.add_parser("clouds", help="shapes and edges of clouds")
     clouds.add_argument("--photographs", nargs="*", type=Path, default=[], help="pictures of clouds to measure too")
+    sheet = parts.add_parser("cloud-sheet", help="draw one picture of each kind of cloud")
+    sheet.add_argument("--out", type=Path, required=True, help="a PNG or JPEG file")
     ground = parts.add_parser("ground", help="share of the ground's pictures that is noise")
     ground.add_argument("--kinds", nargs="+", choices=GROUND_KINDS, default=GROUND_KINDS, help="of ground")
     variety = parts.add_parser("variety", help="how many scenes of recipes look different")
@@ -186,6 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(sky_table())
     elif given.part == "clouds":
         print(cloud_table(given.photographs))
+    elif given.part == "cloud-sheet":
+        write_cloud_sheet(given.out)
     elif given.part == "variety":
         for name in given.recipes:
             print(variety_table(load_recipe(name).recipe, given.family), flush=True)
