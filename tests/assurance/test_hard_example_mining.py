@@ -108,6 +108,7 @@ def test_shares_are_what_the_objective_says(dataset: Path, tmp_path: Path) -> No
         assert sum(place.failures for place in laws[law].bins) == sum(is_hard(record) for record in records) > 3
 
 
+@pytest.mark.slow
 def test_a_familys_own_drogues_have_their_own_cases(tmp_path: Path) -> None:
     variants = [{"drogue": "red-8"}, {"drogue": "red-5"}]
     families = [{"name": "clear"}, {"name": "hazy"}, {"name": "own", "target": {"variants": variants}}]
@@ -213,6 +214,7 @@ def test_a_recipe_in_another_folder_finds_its_drogue(tmp_path: Path, capsys: pyt
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_dataset_of_another_engine_can_be_mined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old, out, dataset = (tmp_path / name for name in ("old.toml", "harder.toml", "dataset"))
     old.write_text(text_of(render={"engine": "mitsuba"}))

@@ -219,6 +219,7 @@ def test_shards_are_merged_from_there_and_to_there(local: Path, place: str, text
     assert contents(f"{place}/whole") == contents(local)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_with_all_its_processes_goes_on(
     place: str, text: str, local: Path, tmp_path: Path
 ) -> None:

@@ -24,7 +24,7 @@ def test_all_examples_are_known() -> None:
 
 
 # The longer ones use what tests of their subjects use.
-SLOW = {"score_an_estimator", "training_loop"}
+SLOW = {"change_a_recipe", "score_an_estimator", "training_loop"}
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 pytestmark = pytest.mark.mitsuba
 
 
-# The longest one uses what tests of scoring use.
-SLOW = {"score_methods"}
+# The longest ones use what tests of scoring and of loaders use.
+SLOW = {"score_methods", "stream_into_training"}
 NAMES = sorted(file.stem for file in EXAMPLES.glob("*.ipynb"))
 
 

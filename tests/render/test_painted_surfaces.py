@@ -188,6 +188,7 @@ def test_scenes_share_shapes_and_each_frame_has_its_own_places_and_paints(
     assert np.flatnonzero(first)[[0, -1]] - np.flatnonzero(moved)[[0, -1]] == pytest.approx(shift_px, abs=1)
 
 
+@pytest.mark.slow
 def test_one_drogue_in_two_conditions_is_drawn_alike_in_any_order(engine: RenderEngine) -> None:
     pairs = pictures_in_both_orders(engine)
     scenes = list(engine._tracer._scenes._scenes.values())  # type: ignore[attr-defined]

@@ -182,7 +182,10 @@ def test_light_beyond_the_collar_does_not_move_the_centre(outer_px: float) -> No
     assert lost or np.abs(np.concatenate(unaware).mean(axis=0)).max() > 0.02
 
 
-@pytest.mark.parametrize(("outer_px", "way"), [(30.0, (5.0, 3.0)), (15.0, (-4.0, 1.0)), (8.0, (1.0, 2.0))])
+@pytest.mark.parametrize(
+    ("outer_px", "way"),
+    [pytest.param(30.0, (5.0, 3.0), marks=pytest.mark.slow), (15.0, (-4.0, 1.0)), (8.0, (1.0, 2.0))],
+)
 def test_annuli_that_move_are_as_good_as_their_covariance(outer_px: float, way: tuple[float, float]) -> None:
     rng, normalized = np.random.default_rng([17, int(outer_px)]), []
     for _ in range(30):

@@ -46,7 +46,12 @@ def draw_moving(
 
 @pytest.mark.parametrize(
     ("radius_px", "way", "growth"),
-    [(30.0, (9.0, -4.0), 0.006), (12.0, (0.0, 6.0), -0.004), (8.0, (2.5, 1.0), 0.0), (4.0, (1.5, -1.5), 0.0)],
+    [
+        pytest.param(30.0, (9.0, -4.0), 0.006, marks=pytest.mark.slow),
+        (12.0, (0.0, 6.0), -0.004),
+        (8.0, (2.5, 1.0), 0.0),
+        (4.0, (1.5, -1.5), 0.0),
+    ],
 )
 def test_moving_discs_are_found_where_they_were_at_mid_exposure(
     monkeypatch: pytest.MonkeyPatch, radius_px: float, way: tuple[float, float], growth: float

@@ -140,6 +140,7 @@ def test_without_hard_pairs_all_batches_are_as_before(ellipse_corpus: Corpus) ->
     np.testing.assert_array_equal(plain.images, none.images)
 
 
+@pytest.mark.slow
 def test_a_training_that_is_stopped_goes_on_with_the_same_hard_pairs(split_dataset: Path, tmp_path: Path) -> None:
     told = io.StringIO()
     settings = settings_with(variant="s", image_passes=16, hard_fraction=0.5, precision="float32", threads=1)

@@ -291,6 +291,7 @@ def test_errors_of_a_training_are_found_before_there_is_data(split_dataset: Path
         check_training(tmp_path / "file", settings)
 
 
+@pytest.mark.slow
 def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     run(split_dataset, first, image_passes=4)

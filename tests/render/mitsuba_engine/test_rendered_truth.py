@@ -64,7 +64,7 @@ def test_centroids_of_lit_markers_are_the_ellipse_centres(engine: RenderEngine) 
     errors, area_ratios = [], []
     # Near drogues in a quarter or half as many pixels a side: their markers have 5 px and more all the same. Far ones
     # in the middle of the paper's view.
-    views = ((0.25, 2.0, 1.0), (0.25, 5.0, 0.5), (0.5, 10.0, 0.25), (1.0, 20.0, 0.25), (1.0, 40.0, 0.125))
+    views = ((0.25, 2.0, 1.0), (0.5, 10.0, 0.25), (1.0, 20.0, 0.25), (1.0, 40.0, 0.125))
     for scale, distance_m, window in views:
         recipe = paper_view_recipe(scale, (distance_m,), samples=1, window=window)
         settings = recipe.render.model_copy(update={"edge_samples_per_px": 64, **FEWEST_ELSEWHERE})
@@ -80,7 +80,7 @@ def test_centroids_of_lit_markers_are_the_ellipse_centres(engine: RenderEngine) 
                 errors.append(measured - center_px)
                 area_ratios.append(got_area / area)
     errors = np.array(errors)
-    assert len(errors) == 5 * 8 * 2
+    assert len(errors) == 4 * 8 * 2
     print("rms px", np.sqrt(np.mean(errors**2)), "mean px", errors.mean(axis=0), "area", np.mean(area_ratios))
     # The bar that the labels are held to; 64 jittered samples in each pixel of an edge leave about 0.0045 px of noise,
     # which falls with the square root of the radius.

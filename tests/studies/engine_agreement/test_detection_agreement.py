@@ -11,6 +11,7 @@ from datasets_manifest.storage.reader import Dataset
 from studies.engine_agreement.detection_agreement import main
 
 
+@pytest.mark.slow
 def test_both_engines_draw_the_same_frames_and_stand_side_by_side(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -53,6 +53,7 @@ def test_the_table_divides_clock_by_clock() -> None:
     assert second.split() == ["200", "2", "104.0", "200.0", "0.90", "1.92", "1.92"]
 
 
+@pytest.mark.slow
 def test_the_kubernetes_job_makes_shards_that_merge(analytic_dataset: Path, tmp_path: Path) -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML comes with Dask: pip install 'droguekit[cluster]'")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
