@@ -59,8 +59,8 @@ PARTS: dict[str, dict[str, Any]] = {
     "no-mosaic": {"mosaic": False},
     ONE_VIEW: {"views": "one"},
 }
-# How the network learns: one setting changed at a time. Filters were He's before, and warm-up took 1,500 passes, here
-# of 5,184.
+# How the network learns: one thing changed at a time, an optimizer with its own rate. Filters were He's before, and
+# warm-up took 1,500 passes, here of 5,184.
 LEARNING: dict[str, dict[str, Any]] = {
     "eca-asff": {},
     "he-filters": {"filter_sd": 0.0},
