@@ -190,7 +190,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif given.part == "clouds":
         print(cloud_table(given.photographs))
     elif given.part == "cloud-sheet":
-        write_cloud_sheet(given.out)
+        try:
+            write_cloud_sheet(given.out)
+        except (OSError, ValueError) as error:
+            parser.error(f"--out: {error}")
     elif given.part == "variety":
         for name in given.recipes:
             print(variety_table(load_recipe(name).recipe, given.family), flush=True)

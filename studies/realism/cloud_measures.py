@@ -110,10 +110,21 @@ def rendered(kind: str, seed: int) -> Picture:
         sky_model="scattering",
     )
     u, v = np.meshgrid(np.arange(_WIDTH_PX) - _WIDTH_PX / 2, np.arange(_HEIGHT_PX) - _HEIGHT_PX / 2)
+    return luminance(EnvironmentRadiance(environment).radiance(pitched_rays(u, v, _FOCAL_PX, up_deg)))
+
+
+def pitched_rays(u_px: Picture, v_px: Picture, focal_px: float, up_deg: float) -> NDArray[np.float32]:
+    """(H, W, 3) unit rays in world axes of a camera that flies east and looks so far up.
+
+    Args:
+        u_px, v_px: (H, W) columns to the right of the middle, and rows below it.
+        focal_px: [px]
+        up_deg: [deg]
+    """
     cosine, sine = np.cos(np.radians(up_deg)), np.sin(np.radians(up_deg))
-    rays = np.stack([_FOCAL_PX * cosine + v * sine, -u, _FOCAL_PX * sine - v * cosine], axis=-1)
-    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
-    return luminance(EnvironmentRadiance(environment).radiance(rays))
+    rays = np.stack([focal_px * cosine + v_px * sine, -u_px, focal_px * sine - v_px * cosine], axis=-1)
+    unit: NDArray[np.float32] = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return unit
 
 
 def photographed(path: Path) -> Picture:

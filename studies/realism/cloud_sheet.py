@@ -13,6 +13,7 @@ from datasets_manifest.types.environment import CloudLayer, Environment, Mist
 from datasets_manifest.types.images import srgb_from_light
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import luminance
+from studies.realism.cloud_measures import pitched_rays
 
 Picture = NDArray[np.uint8]
 
@@ -89,10 +90,7 @@ def cloud_picture(name: str, width_px: int) -> Picture:
     height_px = round(width_px * _HEIGHT_PER_WIDTH)
     columns, rows = width_px * _RAYS_PER_SIDE, height_px * _RAYS_PER_SIDE
     u, v = np.meshgrid(np.arange(columns) + 0.5 - columns / 2, np.arange(rows) + 0.5 - rows / 2)
-    focal, cosine, sine = _FOCAL_PER_WIDTH * columns, np.cos(np.radians(up_deg)), np.sin(np.radians(up_deg))
-    rays = np.stack([focal * cosine + v * sine, -u, focal * sine - v * cosine], axis=-1)
-    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
-    light = EnvironmentRadiance(environment).radiance(rays)
+    light = EnvironmentRadiance(environment).radiance(pitched_rays(u, v, _FOCAL_PER_WIDTH * columns, up_deg))
     light = cv2.resize(light, (width_px, height_px), interpolation=cv2.INTER_AREA)
     exposed = light * (_WHITE / np.percentile(luminance(light), _BRIGHTEST_PERCENT))
     picture: Picture = np.rint(255.0 * srgb_from_light(np.clip(exposed, 0.0, 1.0))).astype(np.uint8)
@@ -115,7 +113,7 @@ def write_cloud_sheet(path: Path, tile_px: int = _TILE_PX) -> None:
         OSError: it cannot be written.
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise ValueError(f"sheet: {path} must end with {', '.join(_SUFFIXES)}")
+        raise ValueError(f"{path} must end with {', '.join(_SUFFIXES)}")
     _, data = cv2.imencode(path.suffix, cv2.cvtColor(cloud_sheet(tile_px), cv2.COLOR_RGB2BGR))
     write_bytes_atomic(path, data.tobytes())
 

@@ -30,10 +30,12 @@ def test_a_picture_is_neither_clipped_nor_dark_and_shows_cloud_before_sky(kind: 
     assert np.mean(blue_over_red > 1.25) > 0.02
 
 
-def test_the_sheet_is_written_and_other_endings_are_refused(tmp_path: Path) -> None:
+def test_the_sheet_is_written_and_other_endings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_cloud_sheet(tmp_path / "clouds.png", tile_px=24)
     sheet = cv2.imread(str(tmp_path / "clouds.png"))
     assert sheet is not None
     assert sheet.shape == (36, 96, 3)
-    with pytest.raises(ValueError, match="must end with"):
+    with pytest.raises(SystemExit) as ended:
         main(["cloud-sheet", "--out", str(tmp_path / "clouds.gif")])
+    assert ended.value.code == 2
+    assert "clouds.gif must end with .jpg, .jpeg, .png" in capsys.readouterr().err
