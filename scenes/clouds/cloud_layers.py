@@ -11,18 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer
+from scenes.clouds.cloud_density import CELLS, HEAP, SHEET, layer_excess
 from scenes.clouds.cloud_textures import BLOBS_PER_TILE, body_tile, lump_volume
-from scenes.clouds.ray_march import (
-    CELLS,
-    EARTH_M,
-    HEAP,
-    MOST_DEPTH,
-    SHEET,
-    enlarge,
-    layer_excess,
-    march_rays,
-    starts_of,
-)
+from scenes.clouds.ray_march import EARTH_M, MOST_DEPTH, enlarge, march_rays, starts_of
 from scenes.clouds.thin_layers import ice_sample_depths, shaft_depth, thin_depth
 from scenes.ground_view import pixel_angle_rad
 from scenes.sky.photometry import Radiance, henyey_greenstein
@@ -190,7 +181,7 @@ class CloudShape:
             kind, swell_m, swell, fine_m, fine, soft_m = CELLS, size_m, 1.3, 0.30 * size_m, 0.30, 0.45
             metric_m = 0.22 * size_m
         else:
-            kind, swell_m, swell, fine_m, fine, soft_m = HEAP, 0.36 * size_m, 2.4, 0.13 * size_m, 0.8, 0.045
+            kind, swell_m, swell, fine_m, fine, soft_m = HEAP, 0.36 * size_m, 2.4, 0.13 * size_m, 0.8, 0.08
             if layer.kind == "congestus":
                 falls, swell, swell_m = (1.1, 2.6), 2.0, 0.28 * size_m
                 metric_m = 1.0 / (1.8 / thick_m + 4.0 / size_m)

@@ -12,8 +12,8 @@ from scipy.special import ndtri
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import CloudLayer, Mist
 from geometry.compiled_loops import compiled
+from scenes.clouds.cloud_density import tile_at
 from scenes.clouds.cloud_textures import BLOBS_PER_TILE, body_tile, ice_tiles
-from scenes.clouds.ray_march import tile_at
 
 _Field = NDArray[np.float32]
 _BODY_SLOPE, _STRAND_SLOPE, _MIST_SLOPE = 2.6, 1.6, 2.2
