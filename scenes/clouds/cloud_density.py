@@ -96,7 +96,7 @@ def _stands_out(torn: float) -> float:
 
 @inlined
 def _bends(body: NDArray[np.float32], u: float, v: float, up: float) -> tuple[float, float]:
-    """Two values that bend lumps at a place, from oblique cuts through a texture, so that they change with the height."""
+    """Two values that bend lumps, from oblique cuts through a texture, so that they change with the height, too."""
     bend = tile_at(body, 1.3 * v + up + 211.0, 1.3 * u - 0.7 * up)
     return bend, tile_at(body, 1.3 * u - up + 97.0, 1.3 * v + 0.7 * up + 301.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drogue_models.frozen_model import ReflectanceRgb
 from scenes.ground.sea import inside_share
@@ -68,14 +69,20 @@ class Airfield:
     def height_m(self, trees_m: Field, x_m: Field, y_m: Field) -> Field:
         """(H, W) height of what stands there: halls, and outside of the field its (H, W) trees. [m]"""
         along, across = self._places(x_m, y_m)
-        open_ = (np.abs(along) < self._half_length_m + _MARGIN_M) & (np.abs(across) < _FIELD_M)
-        height = np.where(open_ | (np.hypot(x_m, y_m) < _OPEN_M), np.float32(0.0), trees_m)
+        height = np.where(self.around(x_m, y_m), trees_m, np.float32(0.0))
         for hall in self._halls:
             inside = (np.abs(along - np.float32(hall.along_m)) < hall.half_length_m) & (
                 np.abs(across - np.float32(hall.across_m)) < hall.half_width_m
             )
             height[inside] = hall.height_m
         return height
+
+    def around(self, x_m: Field, y_m: Field) -> NDArray[np.bool_]:
+        """(H, W) whether places are outside of the field."""
+        along, across = self._places(x_m, y_m)
+        field = (np.abs(along) < self._half_length_m + _MARGIN_M) & (np.abs(across) < _FIELD_M)
+        outside: NDArray[np.bool_] = ~(field | (np.hypot(x_m, y_m) < _OPEN_M))
+        return outside
 
     def hill_share(self, x_m: Field, y_m: Field) -> Field:
         """(H, W) how much of their height hills keep: the field is level."""

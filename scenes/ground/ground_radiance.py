@@ -46,8 +46,10 @@ _HAZY, _HAZY_STEP_PX = 0.5, 2
 # Rays farther apart than this see no hills.
 _COARSE_RAD = 0.012
 # No trees or houses closer than this under a low camera.
-_CLEARING_M, _CLEARING_RAGGED_M, _CLEARING_EDGE_M = 330.0, 70.0, 25.0
+_CLEARING_M, _CLEARING_RAGGED_M, _CLEARING_EDGE_M = 330.0, 70.0, 8.0
 _TALLEST_M = 30.0
+# Nothing stands so close to the water.
+_BARE_SHORE_M = 20.0
 _MEADOW = np.array([0.070, 0.090, 0.038], dtype=np.float32)
 # Illuminance below which towns switch on their lamps.
 _LAMPS_ON_LUX = 40.0
@@ -237,14 +239,15 @@ class Ground:
         # Layouts vary slowly.
         places = x_m + self._shift_m[0], y_m + self._shift_m[1], np.maximum(width_m, np.float32(60.0))
         signs, moved = region_tile().sample(*places), moved_tile().sample(*places)
-        none = ones[..., None]
-        regions = Regions(signs, none, moved, ones, none, ones)
-        # Edges of woods are steep, and crowns differ.
-        crowns = self._cover.crowns(view)
-        cover = np.maximum(self._cover.height_m(view, regions) - np.float32(2.0), 0.0) * (1.1 + 0.16 * crowns)
-        cover = np.minimum(cover, np.float32(_TALLEST_M))
+        regions = Regions(signs, gradient_tile().sample(*places), moved, ones, ones[..., None], ones)
+        trees_m, houses_m = np.moveaxis(self._cover.cover(view, regions, self._cover.axes(regions))[..., :2], -1, 0)
+        # Crowns differ.
+        trees_m = np.maximum(trees_m - np.float32(2.0), 0.0) * (1.1 + 0.16 * self._cover.crowns(view))
+        cover = np.minimum(np.maximum(trees_m, houses_m), np.float32(_TALLEST_M))
         if self._airfield is not None:
             return self._airfield.height_m(cover, x_m, y_m)
+        if self._coast is not None:
+            cover[self._coast.offshore_m(view, signs, moved) > -_BARE_SHORE_M] = 0.0
         result: Field = cover * (1.0 - self._clearing(view))
         return result
 
@@ -307,8 +310,13 @@ class Ground:
         facing = self._beam_cosine(regions.slopes) * regions.sunny * sunlit
         sky = (light.sky_lux / np.pi).astype(np.float32)
         if self._has_cover and seen is not None:
-            facing, shade = self._on_sides(facing, view, seen)
-            sky = sky * shade[..., None]
+            side = self._side_share(view, seen)
+            facing = self._on_sides(facing, view, side, regions.sunny)
+            sky = sky * (1.0 - np.float32(0.45) * side[..., None])
+            if self._airfield is not None:  # its halls have walls of their own
+                side = side * self._airfield.around(view.x_m, view.y_m)
+            if side.any():
+                albedo = albedo + side[..., None] * (self._cover.sides(view, regions, seen) - albedo)
         result: Radiance = albedo * (facing[..., None] * (light.beam_lux / np.pi).astype(np.float32) + sky)
         if shine is not None:
             result += shine[..., None].astype(np.float32) * (light.sky_lux / np.pi).astype(np.float32)
@@ -316,15 +324,21 @@ class Ground:
             result += lamps
         return result
 
-    def _on_sides(self, facing: Field, view: GroundView, seen: Seen) -> tuple[Field, Field]:
-        """(H, W) cosine of the beam and share of the sky's light on the sides of trees and houses, and elsewhere."""
+    def _side_share(self, view: GroundView, seen: Seen) -> Field:
+        """(H, W) share of what is seen that is the side of a tree or house."""
         level_sine = np.float32(self._environment.altitude_m) / np.maximum(seen.distance_m, np.float32(1.0))
-        side = np.clip(np.float32(1.5) - np.float32(0.5) * 5.0 * level_sine / view.sine, 0.0, 1.0)
-        side = side * np.clip(view.sine / np.maximum(np.float32(8.0) * level_sine, 0.02) - np.float32(0.5), 0.0, 1.0)
+        side: Field = np.clip(np.float32(1.5) - np.float32(0.5) * 5.0 * level_sine / view.sine, 0.0, 1.0)
+        result: Field = side * np.clip(
+            view.sine / np.clip(np.float32(8.0) * level_sine, 0.02, 0.6) - np.float32(0.5), 0.0, 1.0
+        )
+        return result
+
+    def _on_sides(self, facing: Field, view: GroundView, side: Field, sunny: Field) -> Field:
+        """(H, W) cosine of the beam on the sides of trees and houses, and elsewhere."""
         to_beam = self._light.beam_direction.astype(np.float32)
         towards = np.maximum(-(view.away_x * to_beam[0] + view.away_y * to_beam[1]), np.float32(0.0))
-        facing = facing + side * (np.float32(0.15) * facing + np.float32(0.75) * towards - facing)
-        return facing, 1.0 - np.float32(0.45) * side
+        result: Field = facing + side * (np.float32(0.15) * facing + np.float32(0.75) * towards * sunny - facing)
+        return result
 
     def _beam_cosine(self, slopes: Field) -> Field:
         """(H, W) cosine between the beam and the normal of terrain with (H, W, 2) slopes."""

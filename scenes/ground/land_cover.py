@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import Environment, GroundKind
-from scenes.ground.land_painting import LandKind
+from scenes.ground.land_painting import TEXELS_M, LandKind
 from scenes.ground.land_tiles import (
     BEAM_SCALE,
     HEIGHT_SCALE_M,
@@ -20,6 +20,7 @@ from scenes.ground.land_tiles import (
     land_textures,
 )
 from scenes.ground.sea import fresnel, inside_share
+from scenes.ground.terrain import Seen
 from scenes.ground_view import Axes, Field, GroundView, MipTile, kept_tile, power_noise, smooth_noise
 
 _SEED = 3
@@ -51,7 +52,14 @@ _TOWN_ABOVE, _TOWN_EDGE = -0.45, 0.12
 # Texels of one tile of detail at several sizes, and its strength there; seen from low altitude.
 _DETAIL: tuple[tuple[float, float], ...] = ((2.3, 0.06), (0.55, 0.075), (0.127, 0.075), (0.031, 0.08))
 _DETAIL_SPAN = 3.0
-_CROWN_TEXEL_M, _PATCH_TEXEL_M = 0.6, 6.0
+# Of the shares of trees and houses between texels, for edges nearby.
+_EDGE_STEEPNESS = 7.0
+# An edge is found to this share of its distance.
+_EDGE_REACH = 0.025
+_CROWN_TEXEL_M, _PATCH_TEXEL_M, _FOLIAGE_TEXEL_M, _HOUSES_TEXEL_M = 0.6, 6.0, 0.25, 1.2
+_FOLIAGE, _FOLIAGE_CONTRAST = np.array([0.034, 0.045, 0.020], dtype=np.float32), 0.3
+_WALL, _WALL_TONE = (np.array(rgb, dtype=np.float32) for rgb in ((0.27, 0.25, 0.22), (0.20, 0.25, 0.32)))
+_STOREY_M, _WINDOW_SPACING_M, _GLASS = 3.0, 3.2, np.float32(0.7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +143,7 @@ class LandCover:
         self._kind = environment.ground
         self._land = _LAND_OF[self._kind]
         self._reflectance = np.array(environment.ground_reflectance_rgb)
+        self._has_lines = self._kind not in ("sea", "mountains")
         self._is_low = environment.altitude_m < LOW_M
         self._shifts_m = rng.uniform(0, 1e5, (2, 8)).astype(np.float32)
         self._river_m, self._road_m = (np.float32(rng.uniform(*limits)) for limits in ((9.0, 34.0), (3.5, 7.0)))
@@ -160,12 +169,51 @@ class LandCover:
             self._shifts_m[1, region] + flip * (self._cosine * north - self._sine * east),
         )
 
-    def height_m(self, view: GroundView, regions: Regions) -> Field:
-        """(H, W) height of trees and houses. [m]"""
+    def cover(self, view: GroundView, regions: Regions, axes: Axes) -> Field:
+        """(H, W, 4) heights of trees, and of houses [m]; and the shares of trees, and of houses, in the plan.
+
+        Seen from nearby, edges of woods and walls are steep.
+        """
+        cover = _cover(self._land, view, axes)
+        if self._land == "town":
+            u, v = axes.turned(view.x_m, view.y_m)
+            rank = land_textures("town").beam.sample(u + axes.shift_u_m, v + axes.shift_v_m, view.across_m)[..., 3]
+            # What stands in the outskirts is of the one or of the other land, not a mean of both.
+            out = self._outskirts(regions, rank) > 0.5
+            if out.any():
+                cover = np.where(out[..., None], _cover("fields", view, axes), cover)
+        if self._has_lines:
+            # Nothing stands on roads and in rivers.
+            away_m = _lines_away_m(regions)
+            cover[(away_m[..., 0] < self._river_m) | (away_m[..., 1] < self._road_m)] = 0.0
+        return cover
+
+    def sides(self, view: GroundView, regions: Regions, seen: Seen) -> Field:
+        """(H, W, 3) reflectance of edges of woods and of walls.
+
+        Args:
+            view: places on them.
+            regions: there.
+            seen: where rays meet them.
+        """
         axes = self.axes(regions)
+        # Places on an edge belong to what stands beside them.
+        wide_m = np.maximum(np.float32(_EDGE_REACH) * seen.distance_m, np.float32(2.0 * TEXELS_M[self._land]))
+        wide = replace(view, across_m=wide_m)
+        trees, houses = np.moveaxis(self.cover(wide, regions, axes)[..., 2:], -1, 0)
         u, v = axes.turned(view.x_m, view.y_m)
-        seen = land_textures(self._land).height.sample(u + axes.shift_u_m, v + axes.shift_v_m, view.across_m)
-        result: Field = np.float32(HEIGHT_SCALE_M) * seen[..., 0]
+        over_m = seen.above_m - regions.above_m
+        # Two oblique cuts, for along an edge that runs as a cut leans there is no change but upwards.
+        leaves = sum(
+            _noise_at(u + np.float32(lean) * over_m, v + over_m, _FOLIAGE_TEXEL_M, view.across_m) for lean in (-1, 1)
+        )
+        foliage = _FOLIAGE * np.maximum(1.0 + np.float32(_FOLIAGE_CONTRAST) * leaves, np.float32(0.2))[..., None]
+        # Windows of storeys; walls stand along u or v, more or less, so that the sum goes along them.
+        window = _within(over_m, _STOREY_M, 0.5, view.across_m) * _within(u + v, _WINDOW_SPACING_M, 0.45, view.across_m)
+        tone = _noise_at(u, v, _HOUSES_TEXEL_M, view.across_m)[..., None]
+        wall = _WALL * np.maximum(1.0 + tone * _WALL_TONE, np.float32(0.3)) * (1.0 - _GLASS * window[..., None])
+        built = (houses / np.maximum(trees + houses, np.float32(1e-3)))[..., None]
+        result: Field = foliage + built * (wall - foliage)
         return result
 
     def seen(self, view: GroundView, regions: Regions, lit_lamps: float) -> tuple[Field, Field, Field | None]:
@@ -249,10 +297,10 @@ class LandCover:
 
     def _lines(self, albedo: Field, sunlit: Field, view: GroundView, regions: Regions) -> tuple[Field, Field]:
         """Rivers, roads and belts of trees along the edges of regions."""
-        if self._kind in ("sea", "mountains"):
+        if not self._has_lines:
             return albedo, sunlit
         blur_m = np.sqrt(view.across_m * view.along_m)
-        away_m = np.abs(regions.signs[..., :3]) / np.maximum(regions.per_m, np.float32(1.5e-4))
+        away_m = _lines_away_m(regions)
         bank, road = (np.float32(half) for half in (14.0, 8.0))
         if self._kind == "dry":
             bed = inside_share(away_m[..., 0], self._river_m * 1.6, blur_m)[..., None]
@@ -285,13 +333,11 @@ class LandCover:
 
     def crowns(self, view: GroundView) -> Field:
         """(H, W) how much crowns of trees stand out, of unit variance."""
-        scale = np.float32(1.0 / _CROWN_TEXEL_M)
-        return _detail().sample(view.x_m * scale, view.y_m * scale, view.across_m * scale)[..., 0]
+        return _noise_at(view.x_m, view.y_m, _CROWN_TEXEL_M, view.across_m)
 
     def patches(self, view: GroundView) -> Field:
         """(H, W) ragged forms of some 200 m, of unit variance."""
-        scale = np.float32(1.0 / _PATCH_TEXEL_M)
-        return _detail().sample(view.x_m * scale, view.y_m * scale, view.across_m * scale)[..., 0]
+        return _noise_at(view.x_m, view.y_m, _PATCH_TEXEL_M, view.across_m)
 
     def detail(self, view: GroundView) -> Field:
         """(H, W) factor of unit mean: tufts and clods."""
@@ -319,6 +365,39 @@ def _weights(tangent: float) -> NDArray[np.float32]:
     place = float(np.interp(np.log(max(tangent, 1e-3)), np.log(SUN_TANGENTS), np.arange(len(SUN_TANGENTS))))
     weights = np.maximum(1.0 - np.abs(np.arange(len(SUN_TANGENTS)) - place), 0.0)
     return np.asarray(weights, dtype=np.float32)
+
+
+def _noise_at(x_m: Field, y_m: Field, texel_m: float, width_m: Field) -> Field:
+    """(H, W) noise of texels of a size, of unit variance, averaged over widths. [m]"""
+    scale = np.float32(1.0 / texel_m)
+    return _detail().sample(x_m * scale, y_m * scale, width_m * scale)[..., 0]
+
+
+def _lines_away_m(regions: Regions) -> Field:
+    """(H, W, 3) distances from the middles of rivers, of roads, and of belts of trees. [m]"""
+    away_m: Field = np.abs(regions.signs[..., :3]) / np.maximum(regions.per_m, np.float32(1.5e-4))
+    return away_m
+
+
+def _within(place_m: Field, period_m: float, share: float, blur_m: Field) -> Field:
+    """(H, W) share of a place of that size that is in the middle of its period, blurred."""
+    away = np.abs(place_m / np.float32(period_m) - np.floor(place_m / np.float32(period_m)) - np.float32(0.5))
+    blur = np.maximum(blur_m / np.float32(period_m), np.float32(0.02))
+    sharp = np.clip((np.float32(0.5 * share) - away) / blur + np.float32(0.5), 0.0, 1.0)
+    mean = np.clip(blur * 2.0 - 0.5, 0.0, 1.0)
+    result: Field = sharp + mean * (np.float32(share) - sharp)
+    return result
+
+
+def _cover(land: LandKind, view: GroundView, axes: Axes) -> Field:
+    """(H, W, 4) as `LandCover.cover` gives it, of one kind of land."""
+    u, v = axes.turned(view.x_m, view.y_m)
+    cover = land_textures(land).cover.sample(u + axes.shift_u_m, v + axes.shift_v_m, view.across_m)
+    near = np.clip(np.float32(2.0) - view.across_m / np.float32(TEXELS_M[land]), 0.0, 1.0)[..., None]
+    shares = cover[..., 2:]
+    steep = np.clip((shares - np.float32(0.5)) * (1.0 + np.float32(_EDGE_STEEPNESS) * near) + np.float32(0.5), 0.0, 1.0)
+    cover[..., :2] *= np.float32(HEIGHT_SCALE_M) * steep / np.maximum(shares, np.float32(1e-2))
+    return cover
 
 
 def _ramp(value: Field, low: float, high: float) -> Field:

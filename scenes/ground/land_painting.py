@@ -49,19 +49,32 @@ _LAMP_SPACING_M = 32.0
 
 @dataclass
 class Canvas:
-    """A texture in work: (N, N, 3) reflectance, (N, N) heights [m] and ranks, and places of lamps [px]."""
+    """A texture in work.
+
+    Attributes:
+        rgb: (N, N, 3) reflectance.
+        height_m: (N, N) of trees and houses.
+        built, wooded: (N, N) shares of houses, and of trees.
+        rank: (N, N) a random number for each parcel.
+        texel_m: size of a texel.
+        lamps_px: places of street lamps.
+    """
 
     rgb: Field
     height_m: Field
+    built: Field
+    wooded: Field
     rank: Field
     texel_m: float
     lamps_px: list[tuple[float, float]] = field(default_factory=list)
 
     def fill(self, area: Rectangle, color: Rgb | NDArray[np.float64], height_m: float = 0.0) -> None:
-        """One colour and height in a rectangle."""
+        """One colour and height in a rectangle; what has a height is a house."""
         x0, y0, x1, y1 = area
         self.rgb[y0:y1, x0:x1] = color
         self.height_m[y0:y1, x0:x1] = height_m
+        self.built[y0:y1, x0:x1] = float(height_m > 0.0)
+        self.wooded[y0:y1, x0:x1] = 0.0
 
     def lamps_along(self, start_px: tuple[int, int], length_px: int, is_column: bool) -> None:
         """Lamps along a street, on alternate sides."""
@@ -79,17 +92,18 @@ def painted_land(kind: LandKind) -> Canvas:
     paint = {"fields": _paint_fields, "forest": _paint_forest, "dry": _paint_dry, "town": _paint_town}[kind]
     shape = (SIZE_PX, SIZE_PX)
     empty = Canvas(
-        np.zeros((*shape, 3), dtype=np.float32),
-        np.zeros(shape, dtype=np.float32),
-        np.full(shape, 0.5, dtype=np.float32),
-        TEXELS_M[kind],
+        rgb=np.zeros((*shape, 3), dtype=np.float32),
+        height_m=np.zeros(shape, dtype=np.float32),
+        built=np.zeros(shape, dtype=np.float32),
+        wooded=np.zeros(shape, dtype=np.float32),
+        rank=np.full(shape, 0.5, dtype=np.float32),
+        texel_m=TEXELS_M[kind],
     )
     paint(empty, frame_generator(SEED, 0, f"paint {kind}"))
     for bend in _BENDS[kind]:
-        stack = np.concatenate([empty.rgb, empty.height_m[..., None]], axis=-1)
-        bent = _bent(stack, *bend)
-        empty.rgb, empty.height_m = bent[..., :3].copy(), bent[..., 3].copy()
-        empty.rank = _bent(empty.rank, *bend)
+        empty.rgb = _bent(empty.rgb, *bend)
+        cover = _bent(np.stack([empty.height_m, empty.built, empty.wooded, empty.rank], axis=-1), *bend)
+        empty.height_m, empty.built, empty.wooded, empty.rank = (cover[..., index].copy() for index in range(4))
     return empty
 
 
@@ -225,6 +239,8 @@ def _plant(canvas: Canvas, wood: Field, stream: str, height_m: float = 13.0) -> 
     tone = np.clip(1.0 + 0.14 * _noise(f"{stream} tone", 1.6, 40) + 0.10 * crowns, 0.5, 1.6)
     canvas.rgb += wood[..., None] * (np.array(_WOOD, dtype=np.float32) * tone[..., None] - canvas.rgb)
     top = np.float32(height_m) * np.clip(1.0 + 0.22 * crowns + 0.15 * _noise(f"{stream} age", 1.6, 60), 0.3, 1.7)
+    is_tree = wood * top > canvas.height_m
+    canvas.built[is_tree], canvas.wooded[is_tree] = 0.0, wood[is_tree]
     canvas.height_m = np.maximum(canvas.height_m, wood * top)
 
 
@@ -288,7 +304,8 @@ def _paint_forest(canvas: Canvas, rng: np.random.Generator) -> None:
     open_ = np.maximum(cleared, glade)[..., None]
     canvas.rgb += open_ * (soil - canvas.rgb)
     canvas.rgb += track[..., None] * (_rgb(0.125, 0.112, 0.085) - canvas.rgb)
-    canvas.height_m *= (1.0 - open_[..., 0]) * (1.0 - track)
+    canvas.wooded[:] = (1.0 - open_[..., 0]) * (1.0 - track)
+    canvas.height_m *= canvas.wooded
 
 
 def _blocks(rng: np.random.Generator, smallest_px: float, largest_px: float) -> Field:

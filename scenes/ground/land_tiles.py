@@ -41,7 +41,7 @@ _LAMP_SPREAD = 0.9  # standard deviation of the logarithm of their intensities
 LAMP_PEAK_CD_M2 = 300.0
 """Radiance of the value 1 of a texture of lamps. [cd/m2]"""
 
-_TILES = ("rgb", "beam", "height")
+_TILES = ("rgb", "beam", "cover")
 # All code that the textures follow from.
 _SOURCES = (
     __file__,
@@ -57,13 +57,13 @@ class LandTextures:
         rgb: reflectance.
         beam: for each of `SUN_TANGENTS` the sun's light on every place over that on level ground, over `BEAM_SCALE`;
             1 on average, weighted with the reflectance. As the fourth channel a rank in [0, 1] that parcels share.
-        height: of trees and houses, over `HEIGHT_SCALE_M`.
+        cover: heights of trees, and of houses, over `HEIGHT_SCALE_M`, and the shares of trees, and of houses.
         lamps_px: (N, 2) places of street lamps before the texture was bent. [px]
     """
 
     rgb: MipTile
     beam: MipTile
-    height: MipTile
+    cover: MipTile
     lamps_px: NDArray[np.float64]
 
 
@@ -71,11 +71,11 @@ class LandTextures:
 def land_textures(kind: LandKind) -> LandTextures:
     """Textures of a kind of land, each of the same size and period; kept on disk, for painting takes seconds."""
     kept = kept_arrays(f"land-{kind}", _SOURCES, lambda: _painted(kind))
-    rgb, beam, height = (
+    rgb, beam, cover = (
         MipTile.from_arrays({key.removeprefix(f"{name} "): kept[key] for key in kept if key.startswith(f"{name} ")})
         for name in _TILES
     )
-    return LandTextures(rgb, beam, height, kept["lamps"])
+    return LandTextures(rgb, beam, cover, kept["lamps"])
 
 
 def _painted(kind: LandKind) -> dict[str, NDArray[Any]]:
@@ -85,8 +85,9 @@ def _painted(kind: LandKind) -> dict[str, NDArray[Any]]:
     beam = np.empty((SIZE_PX, SIZE_PX, 4), dtype=np.float32)
     beam[..., :3] = _beam_shares(canvas.height_m, canvas.texel_m, rgb.mean(axis=-1))
     beam[..., 3] = canvas.rank
-    height = canvas.height_m[..., None] / np.float32(HEIGHT_SCALE_M)
-    tiles = (MipTile(np.clip(texels, 0.0, 1.0), canvas.texel_m, coded=True) for texels in (rgb, beam, height))
+    height = canvas.height_m / np.float32(HEIGHT_SCALE_M)
+    cover = np.stack([height * (1.0 - canvas.built), height * canvas.built, canvas.wooded, canvas.built], axis=-1)
+    tiles = (MipTile(np.clip(texels, 0.0, 1.0), canvas.texel_m, coded=True) for texels in (rgb, beam, cover))
     arrays = {
         f"{name} {key}": array
         for name, tile in zip(_TILES, tiles, strict=True)
