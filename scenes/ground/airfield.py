@@ -32,6 +32,12 @@ class _Rectangle:
     height_m: float
     rgb: ReflectanceRgb
 
+    def holds(self, along_m: Field, across_m: Field, reach_m: Field | np.float32) -> NDArray[np.bool_]:
+        """Whether places are inside, or outside by less than so much along or across. [m]"""
+        along_m, across_m = np.abs(along_m - np.float32(self.along_m)), np.abs(across_m - np.float32(self.across_m))
+        inside: NDArray[np.bool_] = (along_m - reach_m < self.half_length_m) & (across_m - reach_m < self.half_width_m)
+        return inside
+
 
 class Airfield:
     """Runway, taxiway, apron and halls of one scene.
@@ -69,20 +75,19 @@ class Airfield:
     def height_m(self, trees_m: Field, x_m: Field, y_m: Field) -> Field:
         """(H, W) height of what stands there: halls, and outside of the field its (H, W) trees. [m]"""
         along, across = self._places(x_m, y_m)
-        height = np.where(self.around(x_m, y_m), trees_m, np.float32(0.0))
+        open_ = (np.abs(along) < self._half_length_m + _MARGIN_M) & (np.abs(across) < _FIELD_M)
+        height = np.where(open_ | (np.hypot(x_m, y_m) < _OPEN_M), np.float32(0.0), trees_m)
         for hall in self._halls:
-            inside = (np.abs(along - np.float32(hall.along_m)) < hall.half_length_m) & (
-                np.abs(across - np.float32(hall.across_m)) < hall.half_width_m
-            )
-            height[inside] = hall.height_m
+            height[hall.holds(along, across, np.float32(0.0))] = hall.height_m
         return height
 
-    def around(self, x_m: Field, y_m: Field) -> NDArray[np.bool_]:
-        """(H, W) whether places are outside of the field."""
+    def has_hall(self, x_m: Field, y_m: Field, reach_m: Field) -> NDArray[np.bool_]:
+        """(H, W) whether a hall is no farther along or across the field than so much. [m]"""
         along, across = self._places(x_m, y_m)
-        field = (np.abs(along) < self._half_length_m + _MARGIN_M) & (np.abs(across) < _FIELD_M)
-        outside: NDArray[np.bool_] = ~(field | (np.hypot(x_m, y_m) < _OPEN_M))
-        return outside
+        has = np.zeros(along.shape, dtype=np.bool_)
+        for hall in self._halls:
+            has |= hall.holds(along, across, reach_m)
+        return has
 
     def hill_share(self, x_m: Field, y_m: Field) -> Field:
         """(H, W) how much of their height hills keep: the field is level."""

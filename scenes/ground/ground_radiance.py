@@ -17,7 +17,16 @@ from scenes.clouds.cloud_layers import THIN_KINDS, cloud_share
 from scenes.clouds.ray_march import upsample
 from scenes.ground.airfield import Airfield
 from scenes.ground.coast import Coast
-from scenes.ground.land_cover import LOW_M, LandCover, Regions, enlarged, gradient_tile, moved_tile, region_tile
+from scenes.ground.land_cover import (
+    EDGE_REACH,
+    LOW_M,
+    LandCover,
+    Regions,
+    enlarged,
+    gradient_tile,
+    moved_tile,
+    region_tile,
+)
 from scenes.ground.sea import GroundLight, Sea, draw_ships, fresnel, sample_ships
 from scenes.ground.terrain import Seen, Terrain, highest_sine
 from scenes.ground_view import Field, GroundView, ground_view, pixel_angle_rad, view_at
@@ -314,7 +323,8 @@ class Ground:
             facing = self._on_sides(facing, view, side, regions.sunny)
             sky = sky * (1.0 - np.float32(0.45) * side[..., None])
             if self._airfield is not None:  # its halls have walls of their own
-                side = side * self._airfield.around(view.x_m, view.y_m)
+                reach_m = np.float32(EDGE_REACH) * seen.distance_m
+                side = np.where(self._airfield.has_hall(view.x_m, view.y_m, reach_m), np.float32(0.0), side)
             if side.any():
                 albedo = albedo + side[..., None] * (self._cover.sides(view, regions, seen) - albedo)
         result: Radiance = albedo * (facing[..., None] * (light.beam_lux / np.pi).astype(np.float32) + sky)

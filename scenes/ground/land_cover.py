@@ -54,8 +54,6 @@ _DETAIL: tuple[tuple[float, float], ...] = ((2.3, 0.06), (0.55, 0.075), (0.127, 
 _DETAIL_SPAN = 3.0
 # Of the shares of trees and houses between texels, for edges nearby.
 _EDGE_STEEPNESS = 7.0
-# An edge is found to this share of its distance.
-_EDGE_REACH = 0.025
 _CROWN_TEXEL_M, _PATCH_TEXEL_M, _FOLIAGE_TEXEL_M, _HOUSES_TEXEL_M = 0.6, 6.0, 0.25, 1.2
 _FOLIAGE, _FOLIAGE_CONTRAST = np.array([0.034, 0.045, 0.020], dtype=np.float32), 0.3
 _WALL, _WALL_TONE = (np.array(rgb, dtype=np.float32) for rgb in ((0.27, 0.25, 0.22), (0.20, 0.25, 0.32)))
@@ -198,7 +196,7 @@ class LandCover:
         """
         axes = self.axes(regions)
         # Places on an edge belong to what stands beside them.
-        wide_m = np.maximum(np.float32(_EDGE_REACH) * seen.distance_m, np.float32(2.0 * TEXELS_M[self._land]))
+        wide_m = np.maximum(np.float32(EDGE_REACH) * seen.distance_m, np.float32(2.0 * TEXELS_M[self._land]))
         wide = replace(view, across_m=wide_m)
         trees, houses = np.moveaxis(self.cover(wide, regions, axes)[..., 2:], -1, 0)
         u, v = axes.turned(view.x_m, view.y_m)
@@ -358,6 +356,8 @@ class LandCover:
 
 LOW_M = 150.0
 """Altitude below which trees and houses stand up from the ground. [m]"""
+EDGE_REACH = 0.025
+"""An edge of what stands there is found to this share of its distance."""
 
 
 def _weights(tangent: float) -> NDArray[np.float32]:
