@@ -21,6 +21,8 @@ _ROUND_BELOW, _UNDERCUT = 0.3, 0.9
 # Dry air that mixes in at the sides of heaps tears them: the edge gets deeper by this factor, and instead of the lumps
 # so much of the creases between them stands out. Edges get deeper towards the base, too.
 _TORN_DEPTH, _TORN_CREASES, _HEAP_BASE_DEPTH, _BASE_DEPTH = 8.0, 0.8, 3.0, 4.0
+# Sheets thin out towards their gaps, over a share of the larger shape's unit.
+_GAP_EDGE = 1.5
 # Lumps of heaps are bent by this much of their size, so that they differ in size and form.
 _BENT = 0.2
 _BLOB_TEXELS, _LUMP_TEXELS = 64.0, 64.0 / 6.0
@@ -80,12 +82,16 @@ def _torn_share(body: NDArray[np.float32], u: float, v: float, wide: float, h: f
 
 
 @inlined
+def _gap_share(wide: float) -> float:
+    """How close a place of a sheet is to a gap: 0 not at all, 1 at its edge and beyond."""
+    return float(min(max(1.0 - _GAP_EDGE * wide, 0.0), 1.0))
+
+
+@inlined
 def _edge_depth(kind: int, torn: float, h: float) -> float:
     """Depth over which an edge gets dense, over that of a top which is not torn."""
-    below = max(1.0 - 3.0 * h, 0.0)
-    if kind == HEAP:
-        return float(1.0 + max(_HEAP_BASE_DEPTH * below, _TORN_DEPTH * torn))
-    return float(1.0 + _BASE_DEPTH * below)
+    base = _HEAP_BASE_DEPTH if kind == HEAP else _BASE_DEPTH
+    return float(1.0 + max(base * max(1.0 - 3.0 * h, 0.0), _TORN_DEPTH * torn))
 
 
 @inlined
@@ -178,12 +184,13 @@ def excess_at(
         px, py, pz = px + across, py + ahead, pz + above
     elif kind == SHEET:
         swell = lump_at(lumps, lx, ly, 0.6 * lz)
-        wide = tile_at(body, u, v)
+        wide = tile_at(body, u, v) - threshold
+        torn = _gap_share(wide)
         other = tile_at(body, 1.9 * v + 131.0, 1.9 * u)
         top = thick_m * (0.68 + lump_amount * swell + 0.10 * other)
         floor = height_m - thick_m * (0.14 - 0.13 * swell + 0.04 * other)
         fine = min(max(0.25 + 1.6 * h, 0.25), 1.0)
-        excess = min(min(top - height_m, floor), metric_m * (wide - threshold + 0.4 * swell))
+        excess = min(min(top - height_m, floor), metric_m * (wide + 0.4 * swell))
     else:
         patch = tile_at(body, 0.11 * u, 0.15 * v) + 0.4 * tile_at(body, v, u)
         cell = lump_at(lumps, lx, ly, 0.4 * lz)
@@ -239,9 +246,10 @@ def lumps_at(
 def softness_m(shape: NDArray[np.float64], body: NDArray[np.float32], x_m: float, y_m: float, height_m: float) -> float:
     """Depth over which the edge at a place gets dense. [m]"""
     kind, h, torn = int(shape[0]), height_m / shape[2], 0.0
-    if kind == HEAP:
+    if kind != CELLS:
         u, v, _ = _plan_texels(shape[1], x_m, y_m, height_m)
-        torn = _torn_share(body, u, v, tile_at(body, u, v) - shape[3], h)
+        wide = tile_at(body, u, v) - shape[3]
+        torn = _torn_share(body, u, v, wide, h) if kind == HEAP else _gap_share(wide)
     return float(shape[11] * _edge_depth(kind, torn, h))
 
 
