@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.environment import GROUND_KINDS, Environment, SkyModel
+from droguekit.cli.main import DONE, WRONG_INPUT, explain
+from droguekit.output_streams import printable
 from scenes.atmosphere.air_layers import horizon_dip_rad
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import direction_from_angles, luminance
@@ -157,8 +160,12 @@ def sky_table() -> str:
     return "\n".join(rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure and print."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print.
+
+    Returns:
+        The exit code.
+    """
     parser = argparse.ArgumentParser(prog="python -m studies.realism", description=__doc__)
     parts = parser.add_subparsers(dest="part", required=True)
     parts.add_parser("sky", help="colours and luminances of the clear sky")
@@ -181,6 +188,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     judged.add_argument("key", type=Path, help="key.json of the test")
     judged.add_argument("answers", nargs="+", type=Path, help="CSV files: number,answer (photograph or render)")
     given = parser.parse_args(arguments)
+    try:
+        _run(given)
+    except (OSError, ValueError) as error:
+        print(f"realism: error: {printable(explain(error))}", file=sys.stderr)
+        return WRONG_INPUT
+    return DONE
+
+
+def _run(given: argparse.Namespace) -> None:
     if given.part == "blind-test":
         make_test(load_recipe(given.recipe).recipe, given.photographs, given.count, given.out, given.seed)
     elif given.part == "blind-score":
@@ -190,16 +206,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif given.part == "clouds":
         print(cloud_table(given.photographs))
     elif given.part == "cloud-sheet":
-        try:
-            write_cloud_sheet(given.out)
-        except (OSError, ValueError) as error:
-            parser.error(f"--out: {error}")
+        write_cloud_sheet(given.out)
     elif given.part == "variety":
-        for name in given.recipes:
-            print(variety_table(load_recipe(name).recipe, given.family), flush=True)
+        # All are read before the first is measured, which takes minutes.
+        recipes = [load_recipe(name).recipe for name in given.recipes]
+        for recipe in recipes:
+            print(variety_table(recipe, given.family), flush=True)
     else:
         print(ground_table(tuple(given.kinds)))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.importers.photographs import shown_photograph
 from datasets_manifest.recipe.recipe import Recipe
+from drogue_models.untrusted_files import parse_json, read_regular, read_text
 from droguekit.scoring.report.label_drawing import display_picture
 from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.camera.sensor import expose
@@ -22,6 +25,9 @@ KEY_FILE = "key.json"
 # A window shows at least this share of a photograph's width or height, and more of a small one, so that it need not be
 # enlarged.
 _LEAST_SHARE = 0.45
+# Smaller pictures have no part of 4:3.
+_LEAST_PX = 4
+_KINDS = ("ours", "photograph")
 
 Picture = NDArray[np.uint8]
 
@@ -61,20 +67,23 @@ def make_test(recipe: Recipe, photographs: Sequence[Path], count: int, out: Path
         seed: of windows and order.
 
     Raises:
-        ValueError: a photograph cannot be read, or there is none.
+        ValueError: a photograph cannot be read or is tiny, there is none, or a number is out of range.
         OSError: the folder exists or cannot be written.
     """
-    rng = np.random.default_rng(seed)
     if not photographs:
         raise ValueError("--photographs: must name at least one picture")
+    if count < 1:
+        raise ValueError(f"--count: must be at least 1, got {count}")
+    if seed < 0:
+        raise ValueError(f"--seed: must not be negative, got {seed}")
+    rng = np.random.default_rng(seed)
+    # First, so that a picture that cannot be read leaves no folder behind.
+    taken = [photographs[index % len(photographs)] for index in range(count)]
+    windows = [photograph_window(_photograph(path), rng) for path in taken]
     out.mkdir(parents=True)
     mixed: list[tuple[str, Picture]] = []
-    for index in range(count):
-        path = photographs[index % len(photographs)]
-        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ValueError(f"{path}: is not a picture that can be read")
-        mixed.append((f"photograph {path.name}", photograph_window(picture.astype(np.uint8), rng)))
+    for index, (path, window) in enumerate(zip(taken, windows, strict=True)):
+        mixed.append((f"photograph {path.name}", window))
         frame_index = index * recipe.frames.count // count
         mixed.append((f"ours {recipe.name} frame {frame_index}", surroundings_frame(recipe, frame_index)))
     key = {}
@@ -93,22 +102,49 @@ def score(key_file: Path, answers: Sequence[Path]) -> str:
         answers: a CSV file of each judge, with the columns `number` and `answer`: `photograph` or `render`.
 
     Raises:
-        ValueError: a number or an answer is missing or unknown; names the file.
+        ValueError: the key is none, or a number or an answer is missing or unknown; names the file.
+        OSError: a file cannot be read.
     """
-    key: dict[str, str] = json.loads(key_file.read_text(encoding="utf-8"))
+    key = _read_key(key_file)
     rows = ["| judge | ours called photographs | photographs called photographs |", "|---|---|---|"]
     for path in answers:
-        with path.open(encoding="utf-8", newline="") as lines:
-            rows_said = [(row.get("number") or "", row.get("answer") or "") for row in csv.DictReader(lines)]
+        try:
+            lines = csv.DictReader(io.StringIO(read_text(path), newline=""))
+            rows_said = [(row.get("number") or "", row.get("answer") or "") for row in lines]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{path}: is no CSV file in UTF-8; save it as one ({error})") from error
         said = {number.strip().zfill(2): answer.strip() for number, answer in rows_said}
         if said.keys() != key.keys() or not set(said.values()) <= {"photograph", "render"}:
             raise ValueError(f"{path}: must say photograph or render of each number from 01 to {len(key):02d}")
         cells = []
-        for kind in ("ours", "photograph"):
+        for kind in _KINDS:
             told = [said[number] == "photograph" for number, name in key.items() if name.startswith(kind)]
             cells.append(f"{sum(told)} of {len(told)} ({100 * float(np.mean(told)):.0f} %)")
         rows.append(f"| {path.stem} | {' | '.join(cells)} |")
     return "\n".join(rows)
+
+
+def _read_key(path: Path) -> dict[str, str]:
+    """Names of the pictures by their numbers, as `make_test` writes them."""
+    try:
+        key = parse_json(read_regular(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; give the {KEY_FILE} that blind-test wrote") from error
+    names = list(key.values()) if isinstance(key, dict) else []
+    if not all(isinstance(name, str) and name.startswith(_KINDS) for name in names) or any(
+        not any(name.startswith(kind) for name in names) for kind in _KINDS
+    ):
+        raise ValueError(f"{path}: is no key of a blind test; give the {KEY_FILE} that blind-test wrote")
+    return dict(key)
+
+
+def _photograph(path: Path) -> Picture:
+    """(H, W, 3) blue, green, red."""
+    picture = shown_photograph(path)
+    if min(picture.shape[:2]) < _LEAST_PX:
+        raise ValueError(f"{path}: must be at least {_LEAST_PX} px wide and high, got {picture.shape[1::-1]}")
+    code = cv2.COLOR_GRAY2BGR if picture.ndim == 2 else cv2.COLOR_RGB2BGR
+    return np.asarray(cv2.cvtColor(picture, code), dtype=np.uint8)
 
 
 def _fitted(picture: NDArray[np.uint8]) -> Picture:

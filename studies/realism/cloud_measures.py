@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.importers.photographs import shown_photograph
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import luminance
@@ -131,25 +131,28 @@ def photographed(path: Path) -> Picture:
     """(H, W) linear luminance of an sRGB photograph.
 
     Raises:
-        ValueError: not a picture.
+        ValueError: it cannot be read; names the file.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"photograph: {path} is not a picture")
-    encoded = image[..., ::-1] / 255.0
+    picture = shown_photograph(path)
+    encoded = (np.dstack([picture] * 3) if picture.ndim == 2 else picture) / 255.0
     return luminance(np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4))
 
 
 def cloud_table(photographs: Sequence[Path] = ()) -> str:
-    """The measures of the cases, and of photographs, as a table in Markdown."""
+    """The measures of the cases, and of photographs, as a table in Markdown.
+
+    Raises:
+        ValueError: a photograph cannot be read; names the file.
+    """
+    # First, for a picture that cannot be read shall not cost the minutes of the cases.
+    of_photographs = {path.name: measures(photographed(path)) for path in photographs}
     found: dict[str, dict[str, float]] = {}
     for kind in CASES:
         each = [measures(rendered(kind, seed)) for seed in _SEEDS]
         each = [one for one in each if one]
         found[f"`{kind}`"] = {name: float(np.nanmean([one[name] for one in each])) for name in each[0]}
-    for path in photographs:
-        found[path.name] = measures(photographed(path))
     names = list(next(iter(found.values())))
+    found |= of_photographs
     rows = ["| picture | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for title, numbers in found.items():
         rows.append(f"| {title} | " + " | ".join(f"{numbers.get(name, float('nan')):.2f}" for name in names) + " |")

@@ -113,7 +113,7 @@ def write_cloud_sheet(path: Path, tile_px: int = _TILE_PX) -> None:
         OSError: it cannot be written.
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise ValueError(f"{path} must end with {', '.join(_SUFFIXES)}")
+        raise ValueError(f"--out: {path} must end with {', '.join(_SUFFIXES)}")
     _, data = cv2.imencode(path.suffix, cv2.cvtColor(cloud_sheet(tile_px), cv2.COLOR_RGB2BGR))
     write_bytes_atomic(path, data.tobytes())
 

@@ -72,6 +72,8 @@ def look(picture: Picture) -> NDArray[np.float64]:
 
 def clusters(looks: Sequence[NDArray[np.float64]], alike_delta_e: float = ALIKE_DELTA_E) -> NDArray[np.intp]:
     """(N,) cluster of each of N looks by single linkage: looks that are alike are in one, and so are chains of them."""
+    if len(looks) == 1:
+        return np.ones(1, dtype=np.intp)
     values = np.stack(looks)
     # Over blocks, so that one that differs wholly counts by its share of the picture.
     scaled = values / np.sqrt(_COLUMNS * _ROWS)
@@ -94,6 +96,9 @@ def variety_table(recipe: Recipe, only: Sequence[str] = ()) -> str:
     Args:
         recipe: whose scenes to compare.
         only: names of the families to compare; all if empty.
+
+    Raises:
+        ValueError: no scene is of these families.
     """
     names, looks = [], []
     for scene_id in range(recipe.frames.scenes):
@@ -103,6 +108,8 @@ def variety_table(recipe: Recipe, only: Sequence[str] = ()) -> str:
         environment = environment_of_scene(recipe.stream_seed, scene_id, own.environment)
         names.append(own.family)
         looks.append(look(surroundings_picture(environment)))
+    if not looks:
+        raise ValueError(f"--family: recipe {recipe.name} has no scene of {', '.join(only)}")
     found = clusters(looks)
     rows = [f"| {recipe.name} | scenes | clusters | share |", "|---|---|---|---|"]
     for each in [*family_variety(names, found), FamilyVariety("all", len(looks), len(set(found.tolist())))]:

@@ -63,10 +63,3 @@ def test_judges_are_counted(tmp_path: Path) -> None:
         judge.write_text(wrong)
         with pytest.raises(ValueError, match=r"anna\.csv: must say photograph or render of each number from 01 to 04"):
             score(key, [judge])
-
-
-def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
-    other = tmp_path / "notes.txt"
-    other.write_text("x")
-    with pytest.raises(ValueError, match=r"notes\.txt: is not a picture"):
-        make_test(small_recipe(), [other], 1, tmp_path / "test", seed=1)
