@@ -12,6 +12,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import PoseEstimate, write_estimates
 from drogue_models.parts import INSTANCE_STEP, Part, drogue_part_ids
 from droguekit.scoring.detection.detection_metrics import AT_50, Evaluation
 from droguekit.scoring.detection.detection_truth import read_detection_truth
@@ -21,6 +22,7 @@ from labelgen.export.annotations.coco import DROGUE, write_coco
 from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.annotations.yolo import write_yolo_detect
 from labelgen.export.export_log import ExportLog
+from labelgen.export.formats import write_export
 from labelgen.export.packages.huggingface import write_huggingface
 from labelgen.segmentation_masks import amodal_masks, named_parts, union_of_masks
 from labelgen.validation.dataset_checks import validate_dataset
@@ -156,6 +158,22 @@ def test_hugging_faces_card_names_their_parts_and_the_log_counts_them(dataset: P
     card = (tmp_path / "hub" / "README.md").read_text(encoding="utf-8")
     assert f"{int(Part.HOSE)} hose" in card
     assert f"Those of a second drogue and its hose are {INSTANCE_STEP} higher, those of a third 128." in card
+
+
+@pytest.mark.parametrize("format_", ["bop", "kitti", "parquet", "rosbag", "speed", "tum"])
+def test_formats_of_one_drogue_count_the_others(dataset: Path, format_: str, tmp_path: Path) -> None:
+    log = ExportLog()
+    write_export(format_, dataset, tmp_path / "out", log)
+    assert log.losses["drogues beside the sought one: left out"] == len(Dataset(dataset).frame_indices)
+
+
+def test_trajectories_beside_estimates_count_the_others(dataset: Path, tmp_path: Path) -> None:
+    pose = Dataset(dataset).record(0).left_from_drogue
+    assert pose is not None
+    write_estimates(tmp_path / "e.jsonl", [PoseEstimate(frame_index=0, method="joint", left_from_drogue=pose)])
+    log = ExportLog()
+    write_export("tum", dataset, tmp_path / "out", log, estimates=tmp_path / "e.jsonl")
+    assert log.losses["drogues beside the sought one: left out"] == len(Dataset(dataset).frame_indices)
 
 
 def test_networks_of_others_learn_all_of_them(dataset: Path, tmp_path: Path) -> None:

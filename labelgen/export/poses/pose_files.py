@@ -50,7 +50,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: counts images without a drogue, which the format cannot list.
+        log: counts what the lists lack: images without a drogue, and drogues beside the sought one.
 
     Returns:
         The folders of the eyes.
@@ -70,6 +70,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             for split in sorted(set(splits.values())):
                 lists[eye, split] = _PoseList(stack, folder / eye / _SPEED_LISTS[split])
         for record in log.records(source):
+            log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
             for eye in EYES:
                 name = f"img{record.frame_index:06d}.png"
                 export_image(source, record.frame_index, eye, folder / eye / "images" / name, log)
@@ -158,7 +159,7 @@ def write_tum(dataset: Location, out: Path, log: ExportLog, estimates: Path | No
     Args:
         dataset: folder.
         out: folder to make.
-        log: receives the progress, and counts pairs without a pose.
+        log: receives the progress, and counts pairs without a pose and drogues beside the sought one.
         estimates: file of a method's or several methods' estimates, or None for the truth alone.
 
     Returns:
@@ -181,6 +182,7 @@ def write_tum(dataset: Location, out: Path, log: ExportLog, estimates: Path | No
             with (folder / names[-1]).open("w", encoding="utf-8") as stream:
                 stream.write(_HEADER)
                 for record, stamp_ns in pairs:
+                    log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
                     if record.left_from_drogue is None:
                         log.lost("pairs without a drogue are left out")
                         continue
@@ -211,6 +213,9 @@ def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates:
         writer = _TrajectoryFolders(stack, folder, [*([TRUTH_FOLDER] if has_truth else []), *methods])
         for frame_index, stamp_ns, name, record in _places(dataset, log, has_truth):
             truth = None if record is None else record.left_from_drogue
+            if record is not None:
+                log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
+                log.lost("pairs without a drogue are left out of the truth", int(truth is None))
             if truth is not None:
                 writer.add(TRUTH_FOLDER, name, _line(truth, stamp_ns))
             for method, poses in methods.items():

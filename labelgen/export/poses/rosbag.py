@@ -61,7 +61,7 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: folder.
         out: folder to make; it holds a folder for each bag.
-        log: receives the progress, and counts pairs without a pose.
+        log: receives the progress, and counts pairs without a pose and drogues beside the sought one.
 
     Returns:
         The bags' folders.
@@ -83,6 +83,7 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
                 names.append(sequence_name(record.sequence_id))
                 bag = bag_is_open.enter_context(_open_bag(folder / names[-1], record.frame.rig, stamp_ns))
             bag.write_pair(source, record, stamp_ns)
+            log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
             if record.left_from_drogue is None:
                 log.lost("pairs without a drogue have no pose")
     return [out / name for name in names]

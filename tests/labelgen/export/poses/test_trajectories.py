@@ -80,6 +80,13 @@ def test_every_pose_has_the_time_and_the_attitude_of_the_truth(dataset: Path, tm
     assert log.losses["pairs in which joint gives no pose are left out"] >= 1
 
 
+def test_pairs_without_a_drogue_are_counted_beside_estimates(mixed_dataset: Path, tmp_path: Path) -> None:
+    log, estimates = ExportLog(), estimates_of(mixed_dataset, tmp_path / "estimates.jsonl")
+    truth, *_ = write_export("tum", mixed_dataset, tmp_path / "out", log, estimates=estimates)
+    without = len(Dataset(mixed_dataset).frame_indices) - len(numbers(truth / "single_pairs.txt"))
+    assert without > 0 and log.losses["pairs without a drogue are left out of the truth"] == without
+
+
 def test_evo_gives_the_errors_that_were_made(dataset: Path, tmp_path: Path) -> None:
     estimates = estimates_of(dataset, tmp_path / "estimates.jsonl")
     truth, joint, _ = write_export("tum", dataset, tmp_path / "out", ExportLog(), estimates=estimates)
