@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import yaml
+from yaml import MarkedYAMLError
+from yaml.reader import ReaderError
 
 from datasets_manifest.calibration.camera_info import camera_info_of_table, is_camera_info, rig_of_camera_info
 from datasets_manifest.calibration.opencv_storage import (
@@ -266,13 +268,23 @@ def _read_table(text: str, path: Path) -> Mapping[str, Any]:
     """The first document of a YAML file."""
     if len(text) > _LARGEST_YAML:
         raise ValueError(f"{path}: is too large for a calibration; give {_KNOWN}")
-    # OpenCV's header is no directive of YAML.
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+    # OpenCV's header is no directive of YAML; a blank line in its place keeps the numbers of the others.
+    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     try:
         table = next(iter(yaml.safe_load_all("\n".join(lines))), None)
         _check_value_count(table)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: is not YAML: {' '.join(str(error).split())[:200]}") from error
+        raise ValueError(f"{path}: is not YAML: {_yaml_fault(error)}; correct it, or write it anew") from error
     if not isinstance(table, Mapping):
         raise ValueError(f"{path}: is not a calibration that can be read; give {_KNOWN}")
     return table
+
+
+def _yaml_fault(error: Exception) -> str:
+    """The reason for which a text is no YAML that is read, with its place but without the names of the parser's."""
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"line {mark.line + 1}, column {mark.column + 1}: {error.problem}"
+    if isinstance(error, ReaderError):
+        return f"it holds the character {error.character:#04x}, which text files have not"
+    return "it is nested too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:200]

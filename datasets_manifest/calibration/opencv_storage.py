@@ -46,6 +46,10 @@ _XML_TAG = re.compile(r"<[\w]")
 # OpenCV's reader of XML takes time with the square of the numbers in one element: two seconds for so many. Two hundred
 # points in sixty views are 24,000 numbers.
 _MOST_NUMBERS = 25_000
+# What OpenCV's parsers say ends with the line of the text and the reason.
+_PARSER_SAYS = re.compile(r"\((?P<line>\d+)\): (?P<reason>[^\n]+)\s*$")
+# Their word for a text that ends within a list or a table.
+_ENDED_EARLY = "Abort at parse time"
 # Lists within lists of YAML without brackets are opened by dashes or spaces at the beginning of a line.
 _DEEP_BLOCK = re.compile(r"^[ \t?:-]{400}", re.MULTILINE)
 
@@ -150,12 +154,23 @@ def read_calibration_text(path: Path) -> str:
 
 def _storage_table(path: Path) -> dict[str, Any]:
     """All entries of a file of `cv2.FileStorage`: arrays, numbers, texts, or lists of numbers."""
+    text = read_calibration_text(path)
     try:
-        storage = cv2.FileStorage(read_calibration_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         keys = storage.root().keys()
         return {key: _value(storage.getNode(key)) for key in keys}
-    except (cv2.error, SystemError, OverflowError, ValueError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not an OpenCV storage file: {' '.join(str(error).split())[:200]}") from error
+    except (cv2.error, SystemError, OverflowError, ValueError) as error:
+        raise ValueError(f"{path}: is not an OpenCV storage file: {_parser_fault(error)}; write it anew") from error
+
+
+def _parser_fault(error: Exception) -> str:
+    """The reason for which OpenCV could not read a text, without the names of its source files and functions."""
+    # OpenCV's own error is the cause of one by Python that says nothing.
+    said = _PARSER_SAYS.search(str(error.__cause__ or error))
+    if said is None:
+        return "it holds no table of names and values that OpenCV reads"
+    reason = said["reason"].strip().rstrip("!.'")
+    return f"line {said['line']}: {'it ends too early' if reason == _ENDED_EARLY else reason}"
 
 
 def _merged(tables: Sequence[Mapping[str, Any]], paths: Sequence[Path]) -> dict[str, _Entry]:

@@ -301,6 +301,8 @@ def numbers(values: object, name: str) -> Array:
     Raises:
         ValueError: something else, or not finite.
     """
+    if values is None:
+        raise ValueError(f"{name}: must be numbers, got none that can be read")
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
