@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Collection, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -53,6 +53,7 @@ class RunTotals:
     Attributes:
         made: their indices in the order in which they finished.
         retries: attempts that failed by an accident and were repeated.
+        surprises: failed attempts at frames that no earlier run left out.
         stage_s: CPU seconds by stage. [s]
         size_bytes: of their files without the records.
         peak_gib: largest memory of all workers together, measured between frames. [GiB]
@@ -60,6 +61,7 @@ class RunTotals:
 
     made: list[int] = field(default_factory=list)
     retries: int = 0
+    surprises: int = 0
     stage_s: Counter[str] = field(default_factory=Counter)
     size_bytes: int = 0
     peak_gib: float = 0.0
@@ -83,11 +85,13 @@ class RunConditions(NamedTuple):
         is_first: whether the dataset has no frames yet.
         workers: processes that make the frames.
         crash_advice: what to do where native code ends workers.
+        left_out: frames that an earlier run could not make; that they fail again says nothing about this machine.
     """
 
     is_first: bool
     workers: int
     crash_advice: str
+    left_out: frozenset[int]
 
 
 class EventLog:
@@ -104,7 +108,12 @@ class EventLog:
 
 
 def make_frames(
-    task: FrameTask, todo: Sequence[int], options: ExecutionOptions, report: ProgressReport, events: EventLog
+    task: FrameTask,
+    todo: Sequence[int],
+    options: ExecutionOptions,
+    report: ProgressReport,
+    events: EventLog,
+    left_out: Collection[int] = (),
 ) -> tuple[RunTotals, list[Drop]]:
     """Make frames; those that cannot be made are dropped with a reason.
 
@@ -114,6 +123,7 @@ def make_frames(
         options: who makes them.
         report: is told of the progress.
         events: gets every attempt.
+        left_out: indices of frames that an earlier run could not make.
 
     Raises:
         ValueError: an error that other frames would meet too.
@@ -123,7 +133,8 @@ def make_frames(
     totals, drops = RunTotals(), list[Drop]()
     if not todo:
         return totals, drops
-    run = RunConditions(task.engine_version is None, options.worker_count(), crash_advice(task.recipe.render.engine))
+    advice = crash_advice(task.recipe.render.engine)
+    run = RunConditions(task.engine_version is None, options.worker_count(), advice, frozenset(left_out))
     report.begin("pairs", len(todo))
     try:
         with StopRequest(report.say) as stop, closing(_attempts(task, todo, options, stop)) as attempts:
@@ -161,6 +172,7 @@ def _record_attempt(
         events.write("drop" if attempt.final else "retry", frame=attempt.index, reason=reason)
         report.say(f"frame {attempt.index}: {reason}{'' if attempt.final else '; it is tried again'}")
         totals.retries += not attempt.final
+        totals.surprises += attempt.index not in run.left_out
         if attempt.final:
             drops.append(Drop(frame_index=attempt.index, reason=reason))
     if attempt.output:
@@ -216,8 +228,9 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], totals: RunTotals, droppe
     advice = run.crash_advice if isinstance(error, WorkerDiedError) and error.is_of_native_code else ""
     if is_accident(error):
         # Every worker has had a second one by then, so that none was only unlucky.
-        accidents = totals.retries + dropped + 1
-        if not totals.made and accidents >= max(MAX_ATTEMPTS * FIRST_FRAMES, 2 * run.workers):
+        accidents = totals.surprises + 1
+        is_shared = accidents >= max(MAX_ATTEMPTS * FIRST_FRAMES, 2 * run.workers)
+        if is_shared and not totals.made and attempt.index not in run.left_out:
             raise OSError(f"no frame can be made: {accidents} attempts failed, the last: {error}{advice}") from error
         return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}{advice}"
     if not isinstance(error, LostWorkersError):
@@ -304,7 +317,9 @@ def render_dataset(
             made_by, differences = join_build(out, manifest)
             if differences:
                 report.say(f"{_OTHER_BUILD}: {'; '.join(differences)}")
-        totals, dropped = make_frames(task, todo, options, report, events)
+        totals, dropped = make_frames(
+            task, todo, options, report, events, {drop.frame_index for drop in manifest.drops}
+        )
         lost = sorted({*there.damaged} - {*totals.made})
         if lost:
             report.say(f"{len(lost)} damaged pairs could not be made again and are removed: {_shortened(lost)}")

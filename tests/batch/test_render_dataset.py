@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import EventLog, make_frames, render_dataset
 from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerDiedError, run_in_own_process
 from render.engine import EngineUnavailableError
-from tests.support.batch_datasets import ANALYTIC_RECIPE, TINY_RECIPE, file_hashes, render_recipe
+from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, TINY_RECIPE, file_hashes, render_recipe
 
 
 def test_reverse_order_and_two_workers_give_the_same_files(tiny_dataset: Path, tmp_path: Path) -> None:
@@ -82,6 +83,32 @@ def test_a_death_that_the_first_frames_share_ends_the_run(
     with pytest.raises(OSError, match=expected):
         make_frames(task, range(100), ExecutionOptions(workers), PlainProgress(told), EventLog(io.StringIO()))
     assert len(told.getvalue().splitlines()) == most - 1
+
+
+def test_deaths_of_frames_that_were_left_out_before_cost_those_frames_only(
+    troubled: Callable[..., Path], quick_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, left_out = tmp_path / "out", (1, 3, 6)
+    shutil.copytree(quick_dataset, out)
+    for index in left_out:
+        shutil.rmtree(layout.frame_folder(out, index))
+    troubled(refuse=left_out)
+    assert len(render_recipe(out, workers=0, text=QUICK_RECIPE).drops) == 3
+    deaths = [accident(index, number) for number in (1, 2, 3) for index in left_out]
+    monkeypatch.setattr(rendering, "run_tasks", lambda *_: (death for death in deaths))
+    summary = render_recipe(out, workers=2, text=QUICK_RECIPE)
+    assert [drop.frame_index for drop in summary.drops] == [*left_out]
+    assert all(drop.reason == "its worker process died (SIGILL), attempt 3 of 3" for drop in summary.drops)
+
+
+def test_deaths_of_other_frames_end_a_run_beside_those_left_out_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deaths = [accident(index, number) for number in (1, 2, 3) for index in range(10)]
+    monkeypatch.setattr(rendering, "run_tasks", lambda *_: (death for death in deaths))
+    told, task = PlainProgress(io.StringIO()), FrameTask(parse_recipe(TINY_RECIPE), tmp_path, engine_version="1")
+    with pytest.raises(OSError, match="no frame can be made: 9 attempts failed"):
+        make_frames(task, range(10), ExecutionOptions(2), told, EventLog(io.StringIO()), range(5))
 
 
 def test_deaths_after_a_frame_is_made_cost_their_frames_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
