@@ -246,7 +246,7 @@ def _predict(recipe: Recipe, scene: _Scene, light: str, distance_m: float) -> Ma
     from nav.centroids.binary_centroids import smallest_gap_m
 
     layout, rig = marker_layout(recipe.drogue), recipe.rig
-    scale = rig.camera.fx_px / distance_m
+    scale = rig.delivered_focal_px / distance_m
     radius_px = layout.radius_m * scale
     contrast, snr, clipped, sigma_px = _marker_light(recipe, scene, scale)
     bound = None
@@ -332,7 +332,7 @@ def _advice(recipe: Recipe, check: RecipeCheck, scenes: dict[str, _Scene]) -> It
         yield f"{drogue.marker_count} markers leave no spare one: give the drogue at least 4, better 6"
     small = [row.distance_m for row in near if row.radius_px < _SMALLEST_RADIUS_PX]
     if small:
-        needed_m = np.ceil(1e3 * _SMALLEST_RADIUS_PX * near[-1].distance_m / recipe.rig.camera.fx_px) / 1e3
+        needed_m = np.ceil(1e3 * _SMALLEST_RADIUS_PX * near[-1].distance_m / recipe.rig.delivered_focal_px) / 1e3
         yield (
             f"markers are below {_SMALLEST_RADIUS_PX} px radius from {small[0]:.3g} m on: use a radius of "
             f"{needed_m:.2g} m, a longer lens, or by day the method joint-rim, which measures the rim"
@@ -369,7 +369,7 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     faint = [row for row in rows if row.snr < LEAST_SNR or row.contrast <= 0]
     if faint:
         faintest = min(faint, key=lambda row: (row.contrast > 0, row.snr))
-        enough = _least_luminance(recipe, scene, recipe.rig.camera.fx_px / faintest.distance_m)
+        enough = _least_luminance(recipe, scene, recipe.rig.delivered_focal_px / faintest.distance_m)
         use = "" if enough is None else f"{'' if lit else 'lamps of '}{_text(_rounded(enough))} cd/m2, "
         yield (
             f"{name} are below {LEAST_SNR:g} deviations of the noise {when} from {faint[0].distance_m:.3g} m on: use "

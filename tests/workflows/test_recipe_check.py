@@ -69,6 +69,23 @@ def test_size_and_light_follow_the_laws_of_a_pinhole_and_a_lamp(tmp_path: Path) 
     assert day.marker_cd_m2 > 20000.0
 
 
+def test_sizes_and_noise_are_those_of_the_lenses(tmp_path: Path) -> None:
+    """Markers behind eyes of another focal length than the ideal images look as to an ideal rig of that length."""
+    text = written(tmp_path).read_text().replace("[rig]", "seed = 4\n[rig]")
+    ideal = "focal_px = 1700.0\n"
+    recipe = parse_recipe(text.replace(ideal, f"{ideal}eyes = {{ focal_fraction = 0.2 }}\n"), tmp_path)
+    focal_px = recipe.rig.delivered_focal_px
+    # At this seed.
+    assert recipe.rig.camera.fx_px == 1700.0 and focal_px > 1.08 * 1700.0
+    twin = parse_recipe(text.replace(ideal, f"focal_px = {focal_px!r}\n"), tmp_path)
+    for row, expected in zip(check_recipe(recipe).of_light("day"), check_recipe(twin).of_light("day"), strict=True):
+        for name in ("radius_px", "gap_px", "rim_px"):
+            assert getattr(row, name) == pytest.approx(getattr(expected, name))
+        # The meter of the wider ideal camera sees other sky, and the exposure differs by less than a percent.
+        assert row.snr == pytest.approx(expected.snr, rel=0.01)
+        assert row.centroid_sigma_px == pytest.approx(expected.centroid_sigma_px, rel=0.01)
+
+
 def test_more_noise_a_larger_error(tmp_path: Path) -> None:
     """The error of a centre falls as the inverse of signal over noise where nothing is clipped."""
     bright, dim = (checked(written(tmp_path, luminance)).of_light("day")[-3:] for luminance in (20000.0, 5000.0))
