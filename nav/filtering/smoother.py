@@ -57,9 +57,15 @@ def smooth(
         banks = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
         for index, bank in enumerate(_backward_pass(banks), start=first):
             state = summarize_bank(bank, float(times[index]), len(members))
-            estimate = estimates[index]
+            estimate = estimates[index] if index - first in accepted else _without_use(estimates[index])
             smoothed[index] = state.to_estimate(estimate.frame_index, _name(estimate), estimate)
     return smoothed
+
+
+def _without_use(estimate: Estimate) -> Estimate:
+    """A rejected estimate, whose image points the smoothed pose is not computed from."""
+    features = tuple(feature.model_copy(update={"used": False}) for feature in estimate.features)
+    return estimate.model_copy(update={"features": features})
 
 
 def _name(estimate: Estimate) -> str:

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.types.estimates import Estimate, Mode, NoFix, PoseEstimate
+from datasets_manifest.types.estimates import Estimate, Feature, Mode, NoFix, PoseEstimate
 from geometry.se3 import RigidTransform
 from nav.filtering.measurement_update import pose_difference
 from nav.filtering.motion_model import FilterSettings
@@ -118,6 +118,21 @@ def test_the_smoother_beats_the_filter_which_beats_the_fixes(
     errors = [_rms_m(list(each), truth) for each in (raw, filtered, smoothed)]
     # Measured: 0.43 and 0.25 of the fixes' error.
     assert errors[1] < 0.6 * errors[0] and errors[2] < 0.8 * errors[1]
+
+
+def test_image_points_of_a_rejected_fix_are_not_those_of_the_pose(measure: Measure, covariance: np.ndarray) -> None:
+    settings, times = FilterSettings(), [index * 0.04 for index in range(30)]
+    point = Feature(eye="left", index=3, center_px=(5.0, 6.0), cov_px2=((0.01, 0.0), (0.0, 0.01)), used=True)
+    far = RigidTransform(np.eye(3), np.array([1.0, 0, 0]))
+    poses = [_swinging(time) if index != 20 else far @ _swinging(time) for index, time in enumerate(times)]
+    estimates: list[Estimate] = [
+        measure(pose, covariance, None, index).model_copy(update={"features": (point,)})
+        for index, pose in enumerate(poses)
+    ]
+    smoothed = smooth(times, estimates, settings, 8)
+    assert all(isinstance(estimate, PoseEstimate) for estimate in smoothed)
+    used = [[(feature.index, feature.used) for feature in estimate.features] for estimate in smoothed]
+    assert used == [[(3, index != 20)] for index in range(30)]
 
 
 def test_gaps_outliers_and_pauses(measure: Measure, covariance: np.ndarray) -> None:
