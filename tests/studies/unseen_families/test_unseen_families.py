@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer
 
 from datasets_manifest.storage.layout import EVENTS_FILE
 from datasets_manifest.storage.reader import Dataset
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
+from droguekit.cli.main import run
 from scenes.sampler import sample_frame
+from studies.unseen_families import __main__ as unseen_families
 from studies.unseen_families.__main__ import FAMILIES, drogue_families_in, link_without, table_lines
 from studies.world_variety.detection_by_kind import KindScore
 from studies.world_variety.light_sheets import LIGHTS_RECIPE
@@ -66,6 +70,40 @@ def test_a_frame_counts_for_the_type_of_tanker_that_is_in_sight() -> None:
     seen = [FAMILIES["tanker"].seen_in(sample_frame(flown, index)) for index in range(8)]
     assert {"four-jet"} in seen and {"fighter"} in seen and all(len(kinds) == 1 for kinds in seen)
     assert FAMILIES["tanker"].seen_in(sample_frame(plain, 0)) == {"wing"}
+
+
+def test_the_command_trains_without_each_family_and_prints_its_rows(
+    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trainings and scores are stood in for; they have tests of their own."""
+    trained: list[tuple[Path, str, int]] = []
+
+    def train(learned_from: Path, out: Path, cache: Path, image_passes: int, seed: int) -> Path:
+        shown = [drogue_families_in(Dataset(learned_from).record(i).frame) for i in Dataset(learned_from).frame_indices]
+        trained.append((out, "ring" if {"ring"} in shown else "no ring", image_passes))
+        return out / "best.onnx"
+
+    def score(test: Path, network: str, kind_of: object) -> Iterator[KindScore]:
+        assert test == corpus and kind_of is DROGUES.kind_of
+        yield KindScore("ring", 3, 3, 0.5, 0.9 if "everything" in network else 0.4, 0.8, 0)
+
+    monkeypatch.setattr(unseen_families, "train_briefly", train)
+    monkeypatch.setattr(unseen_families, "score_by_kind", score)
+    command, out = typer.Typer(), tmp_path / "out"
+    command.command()(unseen_families.main)
+    words = ["--corpus", str(corpus), "--test", str(corpus), "--out", str(out), "--image-passes", "64"]
+    assert run([*words, "--family", "cone", "--family", "ring"], command) == 0
+    assert trained == [(out / "everything", "ring", 64), (out / "without-ring", "no ring", 64)]
+    told = capsys.readouterr()
+    assert told.out.splitlines()[2:] == ["| ring | 3 | 3 | 90.0 % | 40.0 % |"]
+    assert "no pair shows a drogue of the family cone; it is not left out" in told.err
+
+    def fail(*_: object) -> Path:
+        raise OSError("everything.log: the training failed")
+
+    monkeypatch.setattr(unseen_families, "train_briefly", fail)
+    assert run(words, command) == 2
+    assert capsys.readouterr().err == "error: everything.log: the training failed\n"
 
 
 def test_rows_are_those_of_the_family() -> None:
