@@ -78,6 +78,8 @@ COMMANDS = {
     "bench": Command("droguekit.cli.machine_commands", "Measure the CPU time of a pair by distance and stage."),
     "doctor": Command("droguekit.cli.machine_commands", "Show what is installed and which engines work."),
 }
+# Characters around one that no encoding has, which tell the name that it belongs to.
+_SHOWN_BESIDE = 40
 # Studies are in the repository and not in the wheel: in a clone they lie beside this package.
 _STUDIES, _REPOSITORY = "studies.", Path(__file__).resolve().parents[2]
 
@@ -157,6 +159,11 @@ def explain(error: BaseException) -> str:
     """An error as one line that names its subject."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    if isinstance(error, UnicodeEncodeError):
+        # Such a name cannot be written into a file, and libraries refuse it without saying which it is.
+        part, *_ = error.object[error.end : error.end + _SHOWN_BESIDE].split("/")
+        shown = " ".join((error.object[max(error.start - _SHOWN_BESIDE, 0) : error.end] + part).split())
+        return f"{shown}: has characters that are not UTF-8; rename the file or folder"
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, ValueError | OSError):
         return text

@@ -225,6 +225,14 @@ def test_a_dataset_that_is_not_there(arguments: list[str], tmp_path: Path) -> No
     _assert_refused(_run(name, tmp_path / "missing", *rest), r"missing: there is no such dataset folder")
 
 
+@pytest.mark.parametrize("format_", ["parquet", "huggingface"])
+def test_a_name_that_is_not_utf8_is_told(format_: str, smoke_dataset: Path, tmp_path: Path) -> None:
+    """Libraries refuse such a name without saying which."""
+    place = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9/out"))
+    result = _run("export", smoke_dataset, "--format", format_, "--out", place)
+    _assert_refused(result, r"caf\udce9: has characters that are not UTF-8; rename the file or folder$")
+
+
 def test_wrong_names_of_methods_formats_and_frames(smoke_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     _assert_refused(_run("navigate", smoke_dataset, "--method", "guess", "--out", out), r"'guess'.*paper")
