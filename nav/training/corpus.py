@@ -28,6 +28,7 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PixelBox, ViewRecord
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
@@ -306,6 +307,7 @@ class Corpus:
         places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
         fault: damaged pairs, which are left out, as one line; None for nothing.
         without_drogue: photographs to train on beside the pairs, the same for both eyes, or None.
+        sources: the datasets themselves, for images as they were taken.
     """
 
     datasets: tuple[DatasetStamp, ...]
@@ -314,6 +316,7 @@ class Corpus:
     places: NDArray[np.int64]
     fault: str | None = None
     without_drogue: Photographs | None = None
+    sources: tuple[Dataset, ...] = ()
 
     @property
     def photographs(self) -> NDArray[np.int64]:
@@ -344,6 +347,16 @@ class Corpus:
         dataset, index = self.places[pair]
         image: Image = self.caches[dataset].images[index, eye]
         return image
+
+    def stereo_images(self, pair: int) -> StereoImages:
+        """Both images of a pair as they were taken, read from its dataset.
+
+        Raises:
+            ValueError: they can no longer be read; the message names the file.
+        """
+        dataset, _ = self.places[pair]
+        source: Dataset = self.sources[dataset]
+        return source.images(self.entry(pair).frame_index)
 
     def opacity(self, pair: int, eye: EyeIndex) -> tuple[Cutout, Alpha]:
         """Where the drogue of one eye is cut out, and its (h, w) opacities, 0 to 255; only of `pairs_to_cut`."""
@@ -412,7 +425,7 @@ def open_corpus(
     if without is not None:
         stamps += (DatasetStamp(_PHOTOGRAPHS, without.sha256, "", len(without.images)),)
     places = [(number, index) for number, cache_ in enumerate(caches) for index in range(len(cache_.pairs))]
-    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault, without)
+    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault, without, tuple(datasets))
     if not any(len(corpus.boxes(pair, eye)) for pair in corpus.split("train") for eye in (0, 1)):
         raise ValueError(f"{paths[0]}: shows no drogue in any image of the split train; there is nothing to learn from")
     return corpus

@@ -1,5 +1,8 @@
 """Evaluation of a network on a corpus: batch statistics, predictions, average precision and score threshold.
 
+While it learns, a network searches pictures as they are cached, at the size of its input. At the end the detector of
+the exported file searches the pictures as they were taken, as users let it.
+
 In training each batch normalisation uses the statistics of its own small batch. The running means that it keeps lag
 behind weights that still change, and averaged weights never had batches of their own. So both are measured over many
 images before a network is evaluated or exported.
@@ -12,7 +15,6 @@ import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,12 @@ from torch import Tensor, nn
 
 from datasets_manifest.storage.manifest import SplitName
 from geometry.boxes import intersection_over_union
-from nav.detector.coarse_to_fine import FINE_SCALE, SecondLook, detect_again
-from nav.detector.input_image import PADDING_DN
+from geometry.stereo import EYES
+from nav.detector.detector import Detection
+from nav.detector.input_image import PADDING_DN, letterbox
 from nav.detector.multiscale_inference import detect_multiscale
-from nav.detector.output_maps import MAX_SIDE_PX
-from nav.training.augmentation import Boxes, Image, paint_view, whole_view
+from nav.detector.onnx_detector import OnnxDetector
+from nav.training.augmentation import Boxes, CanvasWindow, Image, clip_boxes, paint_view, whole_view
 from nav.training.corpus import Corpus
 from nav.training.prefetch_map import prefetch_map
 from nav.training.training_settings import SizePx
@@ -100,7 +103,7 @@ def statistics_batches(corpus: Corpus, size_px: SizePx, compute: ComputeDevice) 
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """True and predicted boxes of N images, in corner coordinates of the network's input.
+    """True and predicted boxes of N images, in corner coordinates of the network's input or of the corpus's images.
 
     Attributes:
         truth: N arrays (n, 4) of true boxes.
@@ -113,20 +116,18 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Search:
-    """How a network searches images; with the limits of a training's settings as the detector exported from it does.
+    """How a network searches images while it learns: once, and again at half the size.
 
     Attributes:
         size_px: (height, width) of the network's input.
         batch_images: number of images in a batch.
         large_from_px: boxes whose longer side is at least this come from a second pass at half the size; 0 for a single
             pass.
-        small_below_px: boxes whose longer side is below this are looked at again at twice the scale; 0 for never.
     """
 
     size_px: SizePx
     batch_images: int
     large_from_px: float
-    small_below_px: float = 0.0
 
 
 def predict(
@@ -137,7 +138,9 @@ def predict(
     compute: ComputeDevice,
     advance: Callable[[], None] = lambda: None,
 ) -> Predictions:
-    """Run a network on the images of both eyes of a split, without augmentation.
+    """Run a network on the cached images of both eyes of a split, without augmentation.
+
+    Small boxes are not looked at again, because the images show no more at a larger scale.
 
     Args:
         network: in evaluation mode.
@@ -153,30 +156,60 @@ def predict(
     truth: list[Boxes] = []
     found: list[tuple[Boxes, Boxes]] = []
 
-    fine_size_px = FINE_SCALE * search.size_px[0], FINE_SCALE * search.size_px[1]
-    look = SecondLook(fine_size_px[::-1], search.small_below_px, DEFAULT_THRESHOLD)
-
     def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
         return [whole_image(corpus, pair, eye, search.size_px) for pair, eye in group]
-
-    def fine_image(pair: int, eye: int) -> Image:
-        return whole_image(corpus, pair, eye, fine_size_px)[0]
 
     def run(images: Sequence[Image]) -> list[NDArray[Any]]:
         with torch.inference_mode(), compute.autocast():
             maps = network(to_tensor(np.stack(images), compute))
         return [each.float().cpu().numpy() for each in maps]
 
-    for group, whole in zip(groups, prefetch_map(read, groups, threads=1, ahead=2), strict=True):
+    for whole in prefetch_map(read, groups, threads=1, ahead=2):
         images, boxes = zip(*whole, strict=True)
-        some = detect_multiscale(images, run, search.large_from_px, _MIN_SCORE, MAX_BOXES)
-        if search.small_below_px and max(fine_size_px) <= MAX_SIDE_PX:
-            fine = [partial(fine_image, pair, eye) for pair, eye in group]
-            some = detect_again(some, fine, run, look, _MIN_SCORE, MAX_BOXES)
-        found += some
+        found += detect_multiscale(images, run, search.large_from_px, _MIN_SCORE, MAX_BOXES)
         truth += boxes
         advance()
     return Predictions(truth, found)
+
+
+def detect_split(
+    detector: OnnxDetector, corpus: Corpus, split: SplitName, advance: Callable[[], None] = lambda: None
+) -> Predictions:
+    """Run a detector on the pairs of a split as they were taken, and clip its boxes to the images, as in use.
+
+    Args:
+        detector: of a file.
+        corpus: with the pairs.
+        split: which of them.
+        advance: called after each pair.
+
+    Raises:
+        ValueError: a pair can no longer be read; the message names the file.
+    """
+    pairs = [int(pair) for pair in corpus.split(split)]
+    found: list[tuple[Boxes, Boxes]] = []
+    for images in prefetch_map(corpus.stereo_images, pairs, threads=1, ahead=2):
+        candidates = detector.candidates(images, _MIN_SCORE)
+        found += [_in_corpus(candidates[eye], images.size_px, corpus.size_px[::-1]) for eye in EYES]
+        advance()
+    return Predictions([corpus.boxes(pair, eye) for pair in pairs for eye in (0, 1)], found)
+
+
+def _in_corpus(
+    detections: Sequence[Detection], image_size_px: tuple[int, int], cached_size_px: tuple[int, int]
+) -> tuple[Boxes, Boxes]:
+    """Boxes of an image as the corpus has its true ones, clipped to the image, and their scores.
+
+    Args:
+        detections: the best first.
+        image_size_px, cached_size_px: width and height of the image as it was taken, and in the corpus.
+    """
+    placement = letterbox(image_size_px, cached_size_px)
+    width, height = (round(scale * side) for scale, side in zip(placement.scale, image_size_px, strict=True))
+    boxes = placement.to_input(np.array([one.box_xywh_px for one in detections]))
+    clipped, fractions = clip_boxes(boxes, CanvasWindow(*placement.offset_px, width, height))
+    scores = np.array([one.score for one in detections])
+    return clipped[fractions > 0], scores[fractions > 0]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -16,16 +17,16 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.network import DetectorNetwork
+from nav.detector.onnx_detector import OnnxDetector
 from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
     DEFAULT_THRESHOLD,
     Predictions,
-    Search,
     ValidationScores,
     average_precision,
     best_threshold,
+    detect_split,
     measure_batch_statistics,
-    predict,
     statistics_batches,
 )
 from nav.training.hard_pairs import hard_pairs
@@ -127,7 +128,8 @@ def train(
                 f"the weights at the start fail in {len(hard)} of {len(corpus.split('train'))} pairs to train on"
             )
         Trainer(corpus, settings, compute, out, observer, should_stop, hard).run(state)
-        return _evaluate_and_export(out, corpus, settings, compute, state)
+        evaluator = _Evaluator(corpus, settings, compute, observer, should_stop)
+        return _evaluate_and_export(out, state, evaluator)
 
 
 def check_training(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
@@ -196,45 +198,72 @@ def _summary(corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice,
     )
 
 
-def _evaluate_and_export(
-    out: Path, corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice, state: TrainingState
-) -> TrainingResult:
-    """Evaluate and export the best weights, and export the last ones too."""
-    best_step, network = _best_network(out, settings, state)
-    network.to(compute.device)
-    size = settings.size_at(settings.steps - 1)
-    # The exported files compute in float32, so they are evaluated in float32.
-    exact = ComputeDevice(compute.device, bf16=False)
-    search = Search(size, settings.batch_images, settings.large_from_px, settings.small_below_px)
-    for each in (network, state.average.network):
-        measure_batch_statistics(each, corpus, size, exact)
+@dataclass(frozen=True, eq=False)
+class _Evaluator:
+    """Evaluates networks of a training as the detectors that users get from them."""
 
-    def predictions(split: SplitName, of: DetectorNetwork = network) -> Predictions:
-        return predict(of, corpus, split, search, exact)
+    corpus: Corpus
+    settings: TrainingSettings
+    compute: ComputeDevice
+    observer: TrainingObserver
+    should_stop: Callable[[], bool]
 
-    validation, test = predictions("val"), predictions("test")
-    last_validation = predictions("val", state.average.network)
-    threshold, last_threshold = (
-        best_threshold(each.truth, each.found, DEFAULT_THRESHOLD) for each in (validation, last_validation)
-    )
-    result = TrainingResult(
-        out / ONNX_FILE,
-        best_step,
-        average_precision(validation.truth, validation.found),
-        average_precision(test.truth, test.found),
-        threshold,
-        corpus.fault,
-    )
+    def evaluate(self, network: DetectorNetwork, step: int, file: Path, has_test: bool) -> TrainingResult:
+        """The threshold and the scores of the detector that a network is exported as.
+
+        Args:
+            network: on the training's device; its batch statistics are measured.
+            step: after which it had these weights.
+            file: that it will be exported to.
+            has_test: whether to score the split `test` too.
+        """
+        # The exported files compute in float32.
+        exact = ComputeDevice(self.compute.device, bf16=False)
+        measure_batch_statistics(network, self.corpus, self.settings.size_at(self.settings.steps - 1), exact)
+        result = TrainingResult(file, step, None, None, DEFAULT_THRESHOLD, self.corpus.fault)
+        with TemporaryDirectory() as folder:
+            trial = Path(folder) / file.name
+            export_onnx(network, trial, _metadata(result, self.corpus, self.settings, network))
+            detector = OnnxDetector(trial, threads=torch.get_num_threads())
+        validation = self._detect(detector, "val")
+        threshold = best_threshold(validation.truth, validation.found, DEFAULT_THRESHOLD)
+        detector.metadata = replace(detector.metadata, score_threshold=threshold)
+        if self.settings.small_below_px:
+            # Which boxes are certain, and so not looked at again, depends on the threshold.
+            validation = self._detect(detector, "val")
+        test = self._detect(detector, "test") if has_test else Predictions([], [])
+        return replace(
+            result,
+            validation=average_precision(validation.truth, validation.found),
+            test=average_precision(test.truth, test.found),
+            score_threshold=threshold,
+        )
+
+    def _detect(self, detector: OnnxDetector, split: SplitName) -> Predictions:
+        def advance() -> None:
+            self.observer.advance()
+            if self.should_stop():
+                raise KeyboardInterrupt
+
+        self.observer.begin(f"pairs of the split {split} in which the detector searches", len(self.corpus.split(split)))
+        try:
+            return detect_split(detector, self.corpus, split, advance)
+        finally:
+            self.observer.end()
+
+
+def _evaluate_and_export(out: Path, state: TrainingState, evaluator: _Evaluator) -> TrainingResult:
+    """Evaluate and export the best weights, and the last ones too."""
+    corpus, settings = evaluator.corpus, evaluator.settings
+    best_step, best = _best_network(out, settings, state)
+    result = evaluator.evaluate(best.to(evaluator.compute.device), best_step, out / ONNX_FILE, has_test=True)
     write_text_atomic(out / RESULT_FILE, json.dumps(_result_table(result, corpus, settings), indent=1) + "\n")
-    last = replace(
-        result,
-        best_step=state.step,
-        validation=average_precision(last_validation.truth, last_validation.found),
-        test=None,
-        score_threshold=last_threshold,
-    )
-    export_onnx(network, out / ONNX_FILE, _metadata(result, corpus, settings, network))
-    export_onnx(state.average.network, out / LAST_ONNX_FILE, _metadata(last, corpus, settings, network))
+    export_onnx(best, out / ONNX_FILE, _metadata(result, corpus, settings, best))
+    last, of_last = best, result
+    if state.step != best_step:
+        last = state.average.network
+        of_last = evaluator.evaluate(last, state.step, out / LAST_ONNX_FILE, has_test=False)
+    export_onnx(last, out / LAST_ONNX_FILE, _metadata(of_last, corpus, settings, last))
     return result
 
 

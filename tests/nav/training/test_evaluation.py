@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import io
 import warnings
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +10,20 @@ import pytest
 import torch
 
 from datasets_manifest.types.images import StereoImages
+from droguekit.batch.progress import PlainProgress
+from droguekit.scoring.detection.detector_runner import DetectorRunner
+from droguekit.scoring.results.detection_result import image_id_of
 from geometry.stereo import EYES
 from nav.detector.input_image import letterbox
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.onnx_detector import OnnxDetector
 from nav.detector.output_maps import STRIDES
-from nav.training.corpus import Corpus
+from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
     Search,
     average_precision,
     best_threshold,
+    detect_split,
     measure_batch_statistics,
     predict,
     to_tensor,
@@ -128,21 +134,29 @@ class BrightCells(torch.nn.Module):
         return [torch.cat((40 * each - 30, *[torch.zeros_like(each)] * 4), dim=1) for each in cells]
 
 
-@pytest.mark.parametrize("small_below_px", [0.0, 80.0])
-def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
-    ellipse_corpus: Corpus, tmp_path: Path, small_below_px: float
-) -> None:
-    network, size_px, file = BrightCells().eval(), ellipse_corpus.size_px, tmp_path / "bright.onnx"
+def bright_cells_file(file: Path, size_px: tuple[int, int], metadata: ModelMetadata) -> Path:
     axes = {0: "b", 2: "h", 3: "w"}
-    example = torch.zeros(2, 3, *size_px)
     with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
         torch.onnx.export(
-            network, (example,), file, input_names=["images"], dynamic_axes={"images": axes}, dynamo=False
+            BrightCells().eval(),
+            (torch.zeros(2, 3, *size_px),),
+            file,
+            input_names=["images"],
+            dynamic_axes={"images": axes},
+            dynamo=False,
         )
-    metadata = ModelMetadata(input_size_px=size_px[::-1], small_below_px=small_below_px)
     set_metadata(file, metadata)
-    detector, compute = OnnxDetector(file), ComputeDevice(torch.device("cpu"), bf16=False)
-    seen = predict(network, ellipse_corpus, "train", Search(size_px, 5, 0.0, small_below_px), compute)
+    return file
+
+
+def test_a_learning_network_searches_as_the_detector_exported_from_it_without_a_second_look(
+    ellipse_corpus: Corpus, tmp_path: Path
+) -> None:
+    size_px = ellipse_corpus.size_px
+    metadata = ModelMetadata(input_size_px=size_px[::-1])
+    detector = OnnxDetector(bright_cells_file(tmp_path / "bright.onnx", size_px, metadata))
+    compute = ComputeDevice(torch.device("cpu"), bf16=False)
+    seen = predict(BrightCells().eval(), ellipse_corpus, "train", Search(size_px, 5, 0.0), compute)
     placement = letterbox(size_px[::-1], size_px[::-1])
     number = 0
     for pair in ellipse_corpus.split("train"):
@@ -157,17 +171,29 @@ def test_a_split_is_searched_as_the_exported_detector_searches_pairs(
                 placement.to_image(boxes), [one.box_xywh_px for one in wanted], rtol=0, atol=1e-3
             )
             number += 1
-    plain = predict(network, ellipse_corpus, "train", Search(size_px, 5, 0.0), compute)
-    differ = [not np.array_equal(one, other) for (_, one), (_, other) in zip(seen.found, plain.found, strict=True)]
-    assert any(differ) == (small_below_px > 0)
 
 
-def test_inputs_too_large_to_be_enlarged_are_searched_once(ellipse_corpus: Corpus) -> None:
-    """As the exported detector searches them: boxes of twice the size would exceed the largest input."""
-    network, compute = BrightCells().eval(), ComputeDevice(torch.device("cpu"), bf16=False)
-    plain, again = (
-        predict(network, ellipse_corpus, "train", Search((96, 2080), 4, 0.0, small_px), compute)
-        for small_px in (0.0, 80.0)
-    )
-    for one, other in zip(plain.found, again.found, strict=True):
-        np.testing.assert_array_equal(one[1], other[1])
+def test_a_split_is_evaluated_with_the_boxes_that_detect_writes(split_dataset: Path, tmp_path: Path) -> None:
+    # Of another shape than the pictures, so that there are bars beside them.
+    size_px = (96, 160)
+    corpus = open_corpus([split_dataset], tmp_path / "cache", size_px, 1, PlainProgress(io.StringIO()))
+    metadata = ModelMetadata(input_size_px=size_px[::-1], small_below_px=80.0)
+    detector = OnnxDetector(bright_cells_file(tmp_path / "bright.onnx", size_px, metadata))
+    seen = detect_split(detector, corpus, "train")
+    pairs = [int(pair) for pair in corpus.split("train")]
+    runner = DetectorRunner(split_dataset, lambda _: detector, [corpus.entry(pair).frame_index for pair in pairs])
+    written = defaultdict(list)
+    for box in runner.boxes(0.01, lambda: None):
+        written[box.image_id].append(box)
+    # A picture of 320 x 240 px fills the height of the input, and 128 of its 160 columns.
+    scale = 96 / 240
+    assert sum(map(len, written.values())) > len(pairs)
+    images = [(pair, eye) for pair in pairs for eye in (0, 1)]
+    for (pair, eye), (boxes, scores) in zip(images, seen.found, strict=True):
+        of_image = written[image_id_of(corpus.entry(pair).frame_index, EYES[eye])]
+        wanted = np.array([box.box_xywh for box in of_image]).reshape(-1, 2, 2) * scale + [[16, 0], [0, 0]]
+        # Scales and offsets are exact; what is left are roundings of 1e-14 or so.
+        np.testing.assert_allclose(boxes, wanted.reshape(-1, 4), rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(scores, [box.score for box in of_image])
+    for (pair, eye), truth in zip(images, seen.truth, strict=True):
+        np.testing.assert_array_equal(truth, corpus.boxes(pair, eye))

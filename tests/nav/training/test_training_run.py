@@ -20,14 +20,26 @@ import onnxruntime
 import pytest
 import torch
 
+from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.records import ViewRecord
 from droguekit.batch.progress import PlainProgress
+from droguekit.scoring.detection.detector_runner import DetectorRunner
+from droguekit.scoring.results.detection_result import image_id_of
+from geometry.stereo import EYES
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.training.corpus import open_corpus
+from nav.detector.onnx_detector import OnnxDetector
+from nav.training.augmentation import Boxes
+from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
+    DEFAULT_THRESHOLD,
+    Predictions,
     Search,
     ValidationScores,
     average_precision,
+    best_threshold,
+    detect_split,
     measure_batch_statistics,
     predict,
     to_tensor,
@@ -239,9 +251,64 @@ def test_the_files_of_a_training(split_dataset: Path, tmp_path: Path) -> None:
     # A finished training that is asked for again only evaluates and exports.
     again, told = run(split_dataset, tmp_path, **changes)
     assert again == result and "epoch" not in told
+    # It can be stopped while it evaluates, and leaves no file that is not.
+    result.file.unlink()
+    settings = build_settings(None, {**SMALL, **changes})
+    with pytest.raises(KeyboardInterrupt):
+        train([split_dataset], tmp_path, settings, PlainProgress(io.StringIO()), should_stop=lambda: True)
+    assert not result.file.exists()
     (tmp_path / BEST_FILE).unlink()
     with pytest.raises(ValueError, match=r"best\.pt: is missing"):
         run(split_dataset, tmp_path, **changes)
+
+
+def test_a_training_is_scored_by_what_its_file_finds_in_the_pictures_as_they_were_taken(
+    split_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[tuple[SplitName, float, Predictions]] = []
+
+    def watched(detector: OnnxDetector, corpus: Corpus, split: SplitName, *rest: Any) -> Predictions:
+        found = detect_split(detector, corpus, split, *rest)
+        searched.append((split, detector.metadata.score_threshold, found))
+        return found
+
+    monkeypatch.setattr("nav.training.training_run.detect_split", watched)
+    # Drogues of some 20 px in the input are uncertain, and looked at again: the pictures are 3.3 times as large.
+    changes = {**SMALL, "size_px": (96, 96), "image_passes": 4, "learning_rate": 1e-9, "small_below_px": 80.0}
+    settings, start = build_settings(None, changes, {"variant": "s"}), read_starting_weights("mobile-s")
+    result = train([split_dataset], tmp_path, settings, PlainProgress(io.StringIO()), start=start)
+    detector, threshold = OnnxDetector(result.file), result.score_threshold
+    assert (detector.metadata.score_threshold, detector.metadata.small_below_px) == (threshold, 80.0)
+    assert threshold != DEFAULT_THRESHOLD
+    used = [("val", DEFAULT_THRESHOLD), ("val", threshold), ("test", threshold)]
+    assert [(split, of_detector) for split, of_detector, _ in searched] == used
+    for (split, _, seen), reached in zip(searched[1:], (result.validation, result.test), strict=True):
+        truth, found = boxes_in_use(detector, Dataset(split_dataset), split)
+        for (_, scores), (_, wanted) in zip(seen.found, found, strict=True):
+            np.testing.assert_array_equal(scores, wanted)
+        # Overlaps do not depend on the size at which they are computed, but for their last bits.
+        assert reached == average_precision(truth, found)
+    first = searched[0][2]
+    assert threshold == best_threshold(first.truth, first.found, DEFAULT_THRESHOLD)
+    assert (tmp_path / "last.onnx").read_bytes() == result.file.read_bytes()
+
+
+def boxes_in_use(
+    detector: OnnxDetector, dataset: Dataset, split: SplitName
+) -> tuple[list[Boxes], list[tuple[Boxes, Boxes]]]:
+    """True boxes of each image of a split, and those that `droguekit detect` writes, from corners. [px]"""
+    truth, found = [], []
+    frames = [entry.frame_index for entry in dataset.manifest.frames if entry.split == split]
+    written = list(DetectorRunner(dataset.path, lambda _: detector, frames).boxes(0.01, lambda: None))
+    for frame in frames:
+        for eye in EYES:
+            view: ViewRecord = getattr(dataset.record(frame).views, eye)
+            own = [] if view.box_visible_xywh_px is None else [view.box_visible_xywh_px]
+            truth.append(np.reshape(own, (-1, 4)) + np.array([0.5, 0.5, 0.0, 0.0]))
+            some = [box for box in written if box.image_id == image_id_of(frame, eye)]
+            boxes = np.reshape([box.box_xywh for box in some], (-1, 4))
+            found.append((boxes, np.array([box.score for box in some])))
+    return truth, found
 
 
 @pytest.mark.slow
