@@ -1,16 +1,13 @@
-"""A dataset's files, read by other people's readers (mcap, pycocotools, OpenEXR), against its records."""
+"""A dataset's bags, COCO files and passes against its records; mcap, pycocotools and OpenEXR read what is encoded."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections import defaultdict
 from typing import Any, BinaryIO
 
 import numpy as np
 import pycocotools.mask
 from numpy.typing import NDArray
-from pycocotools.coco import COCO
 
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.storage.image_codecs import read_passes
@@ -22,11 +19,11 @@ from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part, drogue_part_ids
-from drogue_models.untrusted_files import parse_json
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.coco import DROGUE, coco_image_id, coco_neighbours
 from labelgen.export.keypoints import keypoint_count, view_of
 from labelgen.part_pixels import FeaturePixels, drogue_mask
+from labelgen.validation.coco_index import CocoIndex
 from labelgen.validation.label_checks import check_feature_pixels, named_features
 
 # Numbers that went through float64 and one product.
@@ -112,7 +109,7 @@ _TOLERANCE_PX = 1e-9
 
 
 class CocoFiles:
-    """`all.json` and the file of every split that has pairs, in memory."""
+    """`all.json` and the file of every split that has pairs."""
 
     def __init__(self, dataset: Location, manifest: Manifest) -> None:
         """Read all files; those that cannot be read become faults."""
@@ -120,16 +117,14 @@ class CocoFiles:
         self._manifest = manifest
         self._storage = open_storage(dataset)
         self._path = self._storage.where(f"{ANNOTATIONS_FOLDER}/all.json")
-        wanted: dict[str, set[int]] = {"all": set()}
-        for entry in manifest.frames:
-            ids = {coco_image_id(entry.frame_index, eye) for eye in EYES}
-            wanted["all"] |= ids
-            wanted.setdefault(entry.split, set()).update(ids)
-        self._all = self._load("all", wanted.pop("all"))
-        for split, ids in sorted(wanted.items()):
-            part = self._load(split, ids)
-            if part is not None and self._all is not None:
-                self._check_part(split, part)
+        self._splits = {coco_image_id(entry.frame_index, eye): entry.split for entry in manifest.frames for eye in EYES}
+        self._all = self._load("all", np.array(list(self._splits), dtype=np.int64))
+        for split in sorted({*self._splits.values()}):
+            ids = [image_id for image_id, own in self._splits.items() if own == split]
+            part = self._load(split, np.array(ids, dtype=np.int64))
+            if part is not None and self._all is not None and part.digests != {split: self._all.digests.get(split)}:
+                path = self._storage.where(f"{ANNOTATIONS_FOLDER}/{split}.json")
+                self._faults.append(f"{path}: differs from all.json")
 
     def faults(self) -> list[str]:
         """Faults of the files as a whole."""
@@ -138,14 +133,14 @@ class CocoFiles:
     def annotation_faults(self, record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:
         """Faults of the annotation of one image in `all.json`."""
         image_id = coco_image_id(record.frame_index, eye)
-        if self._all is None or image_id not in self._all.imgs:
+        if self._all is None or not self._all.has_image(image_id):
             return []
         view = view_of(record, eye)
         where = f"{self._path}: image {image_id}"
-        annotations = self._all.imgToAnns[image_id]
         try:
+            annotations = self._all.annotations_of(image_id)
             wanted = coco_neighbours(record, eye, part_id, keypoint_count(self._manifest))
-        except ValueError as error:
+        except (OSError, ValueError) as error:
             return [f"{where}: {error}"]
         others = [entry for entry in annotations if entry.get("id") in {other["id"] for other in wanted}]
         # As JSON, in which numbers of both are the same.
@@ -169,43 +164,25 @@ class CocoFiles:
             faults.append("segmentation: differs from the part ids")
         return [f"{where}: {fault}" for fault in faults]
 
-    def _load(self, name: str, ids: set[int]) -> COCO | None:
+    def _load(self, name: str, ids: NDArray[np.int64]) -> CocoIndex | None:
         inside = f"{ANNOTATIONS_FOLDER}/{name}.json"
         path = self._storage.where(inside)
         try:
-            coco = COCO()
-            coco.dataset = parse_json(self._storage.read(inside))
-            # pycocotools reports its progress on standard output.
-            with contextlib.redirect_stdout(io.StringIO()):
-                coco.createIndex()
-            # pycocotools takes a file without annotations for one of images alone.
-            annotation_count = len(coco.dataset["annotations"])
-            categories = [(entry["id"], entry["name"]) for entry in coco.dataset["categories"]]
+            index = CocoIndex(self._storage, inside, self._splits.get)
         except FileNotFoundError:
             self._faults.append(f"{path}: is missing")
             return None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
             self._faults.append(f"{path}: is truncated or not a COCO file: {reason}")
             return None
-        if set(coco.imgs) != ids:
-            self._faults.append(f"{path}: has {len(coco.imgs)} images, its pairs have {len(ids)}")
-        if categories.count((DROGUE, "drogue")) != 1:
+        if not np.array_equal(index.image_ids, np.unique(ids)):
+            self._faults.append(f"{path}: has {len(index.image_ids)} images, its pairs have {len(ids)}")
+        if index.categories.count((DROGUE, "drogue")) != 1:
             self._faults.append(f"{path}: categories: must have the drogue once, with the id {DROGUE}")
-        if 0 in coco.anns or len(coco.anns) != annotation_count:
+        if 0 in index.annotation_ids or len(np.unique(index.annotation_ids)) != len(index.annotation_ids):
             self._faults.append(f"{path}: annotation ids must be unique and above 0")
-        return coco
-
-    def _check_part(self, split: str, part: COCO) -> None:
-        """Check that a split's file agrees with `all.json`."""
-        assert self._all is not None
-        whole: dict[int, Any] = self._all.imgs
-        same = all(whole.get(key) == image for key, image in part.imgs.items())
-        same = same and all(self._all.anns.get(key) == annotation for key, annotation in part.anns.items())
-        same = same and len(part.anns) == sum(len(self._all.imgToAnns[key]) for key in part.imgs if key in whole)
-        if not same:
-            path = self._storage.where(f"{ANNOTATIONS_FOLDER}/{split}.json")
-            self._faults.append(f"{path}: differs from all.json")
+        return index
 
 
 def _is_mask(segmentation: Any, mask: NDArray[np.bool_]) -> bool:

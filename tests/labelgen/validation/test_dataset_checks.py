@@ -183,6 +183,17 @@ def test_a_coco_file_without_annotations_is_a_fault(small_dataset: Path) -> None
     assert f"{path}: is truncated or not a COCO file: has no 'annotations'" in faults_of(small_dataset)
 
 
+@pytest.mark.parametrize("is_zero", [True, False])
+def test_annotation_ids_that_are_not_unique_and_positive_are_a_fault(small_dataset: Path, is_zero: bool) -> None:
+    def edit(table: dict[str, Any]) -> None:
+        first, second, *_ = table["annotations"]
+        first["id"] = 0 if is_zero else second["id"]
+
+    edit_coco(small_dataset, edit)
+    path = small_dataset / "annotations" / "all.json"
+    assert f"{path}: annotation ids must be unique and above 0" in faults_of(small_dataset)
+
+
 def test_a_path_out_of_the_frame_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     edit_record(
         small_dataset, full_pairs[0], lambda table: table["file_sha256"].update({"../../recipe.toml": "0" * 64})
