@@ -161,13 +161,10 @@ def excess_at(
         under = max(1.0 - h * (1.0 / _ROUND_BELOW), 0.0)
         fall = shape[12] * square + shape[13] * square * square + _UNDERCUT * under * under
         wide = tile_at(body, u, v) - threshold
-        torn = _torn_share(body, u, v, wide, h)
-        stands_out = _stands_out(torn)
-        highest = max(HIGHEST_LUMP * stands_out, -stands_out)
-        wide /= 1.0 + 0.25 * max(wide, 0.0)
+        width = wide / (1.0 + 0.25 * max(wide, 0.0))
         amount = lump_amount * (0.35 + h)
         # The most that lumps of all sizes can add.
-        most = metric_m * (wide + amount * 1.5 * HIGHEST_LUMP - fall) + _LUMP_REACH * fine_amount_m
+        most = metric_m * (width + amount * 1.5 * HIGHEST_LUMP - fall) + _LUMP_REACH * fine_amount_m
         if most < 0.0 and seen > 1.0:
             return float(most)
         bend, turn = _bends(body, u, v, up)
@@ -177,9 +174,12 @@ def excess_at(
         if most < 0.0 and seen > 1.0:
             return float(most)
         turret = lump_at(lumps, 2.2 * ly + 0.3, 2.2 * lz, 2.2 * lx)
-        excess = metric_m * (wide + amount * (swell + 0.5 * turret) - fall)
+        excess = metric_m * (width + amount * (swell + 0.5 * turret) - fall)
         floor = height_m - 0.03 * thick_m * (1.0 - swell)
         excess = min(excess, floor)
+        torn = _torn_share(body, u, v, wide, h)
+        stands_out = _stands_out(torn)
+        highest = max(HIGHEST_LUMP * stands_out, -stands_out)
         across, ahead, above, fine = _fine_lumps(body, u, v, up, h, turn)
         px, py, pz = px + across, py + ahead, pz + above
     elif kind == SHEET:
