@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import tarfile
-from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
@@ -237,13 +236,13 @@ def read_shard_index(storage: Storage, number: int) -> ShardIndex:
         missing = name if not storage.exists(name) else shard_file(number)
         raise ValueError(f"{storage.where(missing)}: is missing; render the recipe again to repair it") from error
     except ValidationError as error:
-        raise ValueError(f"{where}: {explain(error)}; render the recipe again to repair it") from error
+        raise ValueError(f"{where}: {explain(error)}; delete it and render the recipe again to repair it") from error
     except OSError as error:
         raise ValueError(f"{where}: cannot be read: {error.strerror}") from error
     if size != index.size:
         raise ValueError(
-            f"{where}: is of a tar file of {index.size} bytes, but that has {size}; render the recipe again to repair "
-            "it"
+            f"{where}: is of a tar file of {index.size} bytes, but that has {size}; delete it and render the recipe "
+            "again to mend it"
         )
     return index
 
@@ -258,7 +257,16 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
     frames: dict[int, dict[str, PackedFile]] = {}
     hashed = _HashedStream(stream)
     try:
-        _read_members(hashed, frames)
+        # Header by header, for the library believes extension headers of any size, which archives of frames lack.
+        while any(header := hashed.read(tarfile.BLOCKSIZE)):
+            member, start = tarfile.TarInfo.frombuf(header, tarfile.ENCODING, "surrogateescape"), hashed.size
+            key, _, name = member.name.partition(".")
+            frame_index = frame_of_name(key)
+            if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or member.size < 0 or frame_index is None:
+                raise ValueError(f"holds {member.name}, which is not a file of a frame")
+            frames.setdefault(frame_index, {})[name] = PackedFile(start, member.size, _hash_member(hashed, member.size))
+        if not hashed.size:
+            raise tarfile.ReadError("empty file")
     except tarfile.TarError as error:
         raise ValueError(f"is not a complete tar file: {error}") from error
     while hashed.read(_BLOCK_BYTES):
@@ -267,42 +275,6 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
         return ShardIndex(size=hashed.size, sha256=hashed.digest.hexdigest(), frames=frames)
     except ValidationError as error:
         raise ValueError(explain(error)) from error
-
-
-def frames_before_damage(stream: BinaryIO) -> dict[int, dict[str, PackedFile]]:
-    """The files, by name, of the frames that a damaged tar file holds before its first damage.
-
-    Of the last frame some files may be missing. A frame without its record is left out.
-
-    Raises:
-        ValueError: it holds something else than frames.
-        OSError: it cannot be read.
-    """
-    frames: dict[int, dict[str, PackedFile]] = {}
-    with suppress(tarfile.TarError):
-        _read_members(_HashedStream(stream), frames)
-    return {index: files for index, files in frames.items() if RECORD_FILE in files and all(map(is_plain_name, files))}
-
-
-def _read_members(hashed: _HashedStream, frames: dict[int, dict[str, PackedFile]]) -> None:
-    """Add the members of an archive up to its end.
-
-    Raises:
-        TarError: of `tarfile`; the archive is damaged, and what stands before the damage has been added.
-        ValueError: a member is no file of a frame.
-    """
-    # Header by header, for the library believes extension headers of any size, which archives of frames lack.
-    while any(header := hashed.read(tarfile.BLOCKSIZE)):
-        member, start = tarfile.TarInfo.frombuf(header, tarfile.ENCODING, "surrogateescape"), hashed.size
-        key, _, name = member.name.partition(".")
-        frame_index = frame_of_name(key)
-        if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or member.size < 0 or frame_index is None:
-            raise ValueError(f"holds {member.name}, which is not a file of a frame")
-        file = PackedFile(start, member.size, _hash_member(hashed, member.size))
-        frames.setdefault(frame_index, {})[name] = file
-    if not header:
-        # Cut off between two members, it would pass for a whole archive of fewer frames.
-        raise tarfile.ReadError("it lacks its end")
 
 
 def _hash_member(stream: _HashedStream, size_bytes: int) -> str:

@@ -1,8 +1,8 @@
 """Packs finished frames into tar files, so that a run that is killed at any instant loses no frame.
 
 A frame is first written into a folder of its own. Once all frames of a tar file exist, the archive is written and
-appears whole; then the index beside it; and only then are the folders removed. An archive without its index gets a new
-one from `repair_shards`, and a damaged archive is written anew with the frames that can be read of it.
+appears whole; then the index beside it; and only then are the folders removed. An archive without an index gets a new
+one from `repair_shards`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import BinaryIO
 
-from pydantic import ValidationError
-
 from datasets_manifest.storage.frame_store import (
     MAX_PAIRS_PER_TAR,
     FrameStore,
     PackedFile,
     ShardIndex,
     ShardLayout,
-    frames_before_damage,
     index_of_archive,
     index_text,
     member_name,
@@ -37,6 +34,7 @@ from datasets_manifest.storage.layout import (
     FRAMES_FOLDER,
     RECORD_FILE,
     SHARDS_FILE,
+    SHARDS_FOLDER,
     frame_name,
     frame_of_name,
     is_plain_name,
@@ -181,62 +179,29 @@ def remove_packed(dataset: Location, frame_indices: Collection[int]) -> None:
             storage.delete(shard_file(number))
 
 
-def repair_shards(dataset: Location) -> list[str]:
-    """Rebuild indices that are missing, damaged or of another archive, and write damaged archives anew.
-
-    A damaged archive keeps the frames in front of the damage; the others are missing then. Only while no other process
-    writes into the dataset.
-
-    Returns:
-        A line for each damaged archive.
+def repair_shards(dataset: Location) -> None:
+    """Rebuild the indices that killed runs did not write; only while no other process writes into the dataset.
 
     Raises:
-        ValueError: a tar file holds something else than frames; names it.
+        ValueError: a tar file is damaged; names it.
         OSError: it cannot be read or written.
     """
     storage = open_storage(dataset)
     if read_pairs_per_tar(storage) is None:
-        return []
-    numbers, faults = shard_numbers(storage), []
-    for number, is_listed in zip(numbers, map_in_order(partial(_is_listed, storage), numbers, storage), strict=True):
-        if not is_listed and (fault := _repair_shard(storage, number)) is not None:
-            faults.append(f"{storage.where(shard_file(number))}: {fault}")
-    return faults
-
-
-def _is_listed(storage: Storage, number: int) -> bool:
-    """Whether a tar file has an index that belongs to it, by its size."""
-    try:
-        index = ShardIndex.model_validate_json(storage.read(shard_index_file(number)))
-    except (FileNotFoundError, ValidationError):
-        return False
-    return storage.size(shard_file(number)) == index.size
-
-
-def _repair_shard(storage: Storage, number: int) -> str | None:
-    """Write the index of a tar file, or a damaged tar file and its index anew, and return what was damaged."""
-    archive = shard_file(number)
-    try:
-        with storage.open(archive) as stream:
-            index = index_of_archive(stream)
-    except ValueError as error:
-        damage = error
-    else:
+        return
+    names = set(storage.names(SHARDS_FOLDER))
+    for number in shard_numbers(storage):
+        if f"{number:06d}.json" in names:
+            continue
+        try:
+            with storage.open(shard_file(number)) as stream:
+                index = index_of_archive(stream)
+        except ValueError as error:
+            where = storage.where(shard_file(number))
+            raise ValueError(
+                f"{where}: {error}; delete it and run the same command to make its frames again"
+            ) from error
         storage.write(shard_index_file(number), index_text(index).encode())
-        return None
-    try:
-        with storage.open(archive) as stream:
-            left = frames_before_damage(stream)
-    except ValueError as error:
-        raise ValueError(
-            f"{storage.where(archive)}: {error}; delete it and run the same command to make its frames again"
-        ) from error
-    if left:
-        _pack(storage, number, _all_packed(storage, number, left))
-    else:
-        storage.delete(shard_index_file(number))
-        storage.delete(archive)
-    return f"{damage}; its pairs that can be read stay ({len(left)}), the others are missing until they are made again"
 
 
 def _indices(names: list[str]) -> set[int]:

@@ -35,7 +35,6 @@ from datasets_manifest.storage.storage import Location, map_in_order, open_stora
 from datasets_manifest.storage.writer import remove_frame, remove_leftovers
 from datasets_manifest.types.records import PairRecord
 from drogue_models.untrusted_files import parse_json
-from droguekit.batch.progress import ProgressReport
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
@@ -53,12 +52,7 @@ _OWN_NAMES = {
 
 
 @contextmanager
-def open_dataset(
-    out: Location,
-    source: RecipeSource,
-    pairs_per_tar: int | None = None,
-    report: ProgressReport | None = None,
-) -> Iterator[TextIO]:
+def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
     """Open a new dataset, or one to be completed, and keep other runs out of it.
 
     Frames of a folder without a manifest are removed, and so are half-written files of killed runs. A new folder is
@@ -71,7 +65,6 @@ def open_dataset(
         out: its place.
         source: its recipe.
         pairs_per_tar: frames in a tar file; None keeps what the dataset has.
-        report: is told of damaged tar files.
 
     Yields:
         The stream to which events are appended.
@@ -86,9 +79,7 @@ def open_dataset(
         remove_leftovers(out)
         _check_or_create(out, source)
         configure_packing(out, pairs_per_tar)
-        for line in repair_shards(out):
-            if report is not None:
-                report.say(line)
+        repair_shards(out)
         yield events
 
 

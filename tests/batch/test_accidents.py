@@ -313,24 +313,6 @@ def test_a_tar_file_whose_last_frame_is_removed_goes_with_it(
     assert sorted(path.name for path in (out / layout.SHARDS_FOLDER).iterdir()) == ["layout.json"]
 
 
-@pytest.mark.parametrize(("share", "lost"), [(0.0, 3), (0.4, 2), (0.7, 1)])
-def test_one_run_makes_a_dataset_whole_whose_tar_file_was_cut_off(
-    share: float, lost: int, analytic_dataset: Path, tmp_path: Path
-) -> None:
-    out, told = tmp_path / "out", io.StringIO()
-    shutil.copytree(analytic_dataset, out)
-    render_recipe(out, workers=ExecutionOptions(0, pairs_per_tar=3), text=ANALYTIC_RECIPE)
-    archives = file_hashes(out)
-    tar = out / layout.shard_file(1)
-    os.truncate(tar, int(share * tar.stat().st_size))
-    summary = render_recipe(out, workers=0, text=ANALYTIC_RECIPE, told=told)
-    assert (summary.pairs, summary.drops) == (8, ())
-    assert file_hashes(out) == archives
-    # The pairs before the cut stay.
-    assert len(summary.totals.made) == lost
-    assert f"{tar}: " in told.getvalue()
-
-
 def test_a_whole_copy_in_a_tar_file_outlives_a_damaged_folder(
     troubled: Troubled, quick_dataset: Path, tmp_path: Path
 ) -> None:
