@@ -53,6 +53,8 @@ def test_an_index_has_what_pycocotools_reads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, layout: dict[str, Any]
 ) -> None:
     monkeypatch.setattr(coco_index, "_BLOCK_BYTES", block_bytes)
+    # Annotations of an image are read one by one, some at once, or all at once.
+    monkeypatch.setattr(coco_index, "_NEAR_BYTES", 20 * block_bytes)
     index = index_of(write(tmp_path, json.dumps(table(60), **layout)))
     with contextlib.redirect_stdout(io.StringIO()):
         coco = COCO(str(tmp_path / "all.json"))
@@ -94,7 +96,12 @@ def test_a_truncated_file_is_refused_wherever_it_ends(tmp_path: Path) -> None:
         ('{"images":[{"file_name":"1"}]}', "id"),
         ('{"images":[{"id":1e999}]}', "inite|Infinity|float"),
         ('{"images":[' + "[" * 100_000, "nested"),
+        ('{"images":[null],"annotations":[],"categories":[]}', "NoneType"),
+        ('{"images":[],"annotations":[null],"categories":[]}', "NoneType"),
+        ('{"images":[],"annotations":[],"annotations":[],"categories":[]}', "annotations twice"),
+        ('{"images":[],"info":"' + "b" * 300 + '",]', "at byte 323"),
         ('{"info":"' + "a" * 3000 + '"}', "a value of more than 1000 bytes at byte 8"),
+        ('{"info":"' + "a" * 1020 + '"}', "a value of more than 1000 bytes at byte 8"),
     ],
 )
 def test_what_is_no_coco_file_is_refused(
