@@ -54,10 +54,10 @@ def smooth(
             for index in members
             if isinstance(measurement := measurements[index], PoseMeasurement)
         }
-        banks = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
+        banks, used = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
         for index, bank in enumerate(_backward_pass(banks), start=first):
             state = summarize_bank(bank, float(times[index]), len(members))
-            estimate = estimates[index] if index - first in accepted else _without_use(estimates[index])
+            estimate = estimates[index] if index - first in used else _without_use(estimates[index])
             smoothed[index] = state.to_estimate(estimate.frame_index, _name(estimate), estimate)
     return smoothed
 
@@ -112,9 +112,12 @@ def _segments(
 
 def _forward_pass(
     times: Times, measurements: Mapping[int, PoseMeasurement], settings: FilterSettings, symmetry_order: int
-) -> list[Bank]:
-    """Filter one segment: the bank at each time, after its measurement if any; there is one at the first time."""
-    banks, measured_times = [initial_bank(measurements[0], settings)], times[sorted(measurements)]
+) -> tuple[list[Bank], set[int]]:
+    """Filter one segment: the bank at each time, after its measurement if any, and the indices of those that it took.
+
+    There is one at the first time.
+    """
+    banks, used, measured_times = [initial_bank(measurements[0], settings)], {0}, times[sorted(measurements)]
     branches = True
     for index in range(1, len(times)):
         later = int(np.searchsorted(measured_times, times[index]))
@@ -125,8 +128,10 @@ def _forward_pass(
         if index in measurements:
             corrected = correct_bank(bank, measurements[index], settings, symmetry_order).bank
         branches = corrected is not None
+        if branches:
+            used.add(index)
         banks.append(corrected or bank)
-    return banks
+    return banks, used
 
 
 def _backward_pass(banks: Sequence[Bank]) -> list[Bank]:
