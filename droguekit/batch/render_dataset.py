@@ -317,9 +317,8 @@ def render_dataset(
             made_by, differences = join_build(out, manifest)
             if differences:
                 report.say(f"{_OTHER_BUILD}: {'; '.join(differences)}")
-        totals, dropped = make_frames(
-            task, todo, options, report, events, {drop.frame_index for drop in manifest.drops}
-        )
+        left_out = {drop.frame_index for drop in manifest.drops if drop.reason != _VANISHED}
+        totals, dropped = make_frames(task, todo, options, report, events, left_out)
         lost = sorted({*there.damaged} - {*totals.made})
         if lost:
             report.say(f"{len(lost)} damaged pairs could not be made again and are removed: {_shortened(lost)}")

@@ -159,7 +159,7 @@ def explain(error: BaseException) -> str:
     """An error as one line that names its subject."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
-    if isinstance(error, UnicodeEncodeError):
+    if isinstance(error, UnicodeEncodeError) and error.encoding == "utf-8":
         # Such a name cannot be written into a file, and libraries refuse it without saying which it is.
         part, *_ = error.object[error.end : error.end + _SHOWN_BESIDE].split("/")
         shown = " ".join((error.object[max(error.start - _SHOWN_BESIDE, 0) : error.end] + part).split())

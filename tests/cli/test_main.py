@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from droguekit.cli.main import COMMANDS, DONE, INTERRUPTED, WRONG_INPUT, run
+from droguekit.cli.main import COMMANDS, DONE, INTERRUPTED, WRONG_INPUT, explain, run
 
 HEAVY = ("numpy", "scipy", "cv2", "pydantic", "mitsuba", "trimesh", "matplotlib", "distributed", "OpenEXR")
 
@@ -110,3 +110,13 @@ def test_a_terminated_command_leaves_nothing_half_written(tmp_path: Path) -> Non
     result = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr.strip()) == (INTERRUPTED, "droguekit: interrupted")
     assert list(work.iterdir()) == []
+
+
+def test_only_names_that_are_not_utf_8_are_said_to_be_none() -> None:
+    name = "out/caf\udce9"
+    with pytest.raises(UnicodeEncodeError) as wrong:
+        name.encode()
+    assert explain(wrong.value) == f"{name}: has characters that are not UTF-8; rename the file or folder"
+    with pytest.raises(UnicodeEncodeError) as narrow:
+        "out/café".encode("ascii")
+    assert "rename" not in explain(narrow.value)
