@@ -286,5 +286,5 @@ def _yaml_fault(error: Exception) -> str:
         mark = error.problem_mark
         return f"line {mark.line + 1}, column {mark.column + 1}: {error.problem}"
     if isinstance(error, ReaderError):
-        return f"it holds the character {error.character:#04x}, which text files have not"
+        return f"it holds the character {error.character:#04x}, which is not allowed in YAML"
     return "it is nested too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:200]

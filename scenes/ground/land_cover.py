@@ -380,7 +380,7 @@ def _lines_away_m(regions: Regions) -> Field:
 
 
 def _within(place_m: Field, period_m: float, share: float, blur_m: Field) -> Field:
-    """(H, W) share of a place of that size that is in the middle of its period, blurred."""
+    """(H, W) blurred square wave: 1 in the middle `share` of each period, and 0 between."""
     away = np.abs(place_m / np.float32(period_m) - np.floor(place_m / np.float32(period_m)) - np.float32(0.5))
     blur = np.maximum(blur_m / np.float32(period_m), np.float32(0.02))
     sharp = np.clip((np.float32(0.5 * share) - away) / blur + np.float32(0.5), 0.0, 1.0)

@@ -24,7 +24,7 @@ JARGON = re.compile(r"cv2|OpenCV\(|\.cpp|error: \(|in function|exception set|<cl
         ("alias.yaml", "cam0: *a\n", "line 1, column 7: found undefined alias 'a'"),
         ("tag.yaml", "cam0: !!python/object:os.system x\n", "line 1, column 7: could not determine a constructor"),
         ("tab.yaml", "a:\n\tb: 1\n", r"line 2, column 1: found character '\\t'"),
-        ("nul.yaml", "a: \0b", "it holds the character 0x00, which text files have not"),
+        ("nul.yaml", "a: \0b", "it holds the character 0x00, which is not allowed in YAML"),
         ("date.yaml", "a: 2001-99-99\n", "month must be in 1..12"),
         ("indent.yml", f"{OPENCV}M1: {MATRIX}  data: [ 1, 2\n", "line 7: Incorrect indentation;"),
         ("tab.yml", f"{OPENCV}M1: !!opencv-matrix\n\trows: 3\n", "line 4: Tabs are prohibited in YAML;"),
