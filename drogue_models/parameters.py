@@ -1,6 +1,7 @@
 """Dimensions and surface properties of a drogue, from a preset or a user's TOML file.
 
-Drogue frame: origin at the centre of the marker circle in the rim plane, z along the axis from the mouth to the hose.
+Drogue frame: origin at the centre of the rim circle, x and y in the rim plane, z along the axis from the mouth to the
+hose.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ rig = {rig}
 count = {pairs}
 scenes = {scenes}
 
-# Distance of the rim's centre: all sizes in the image equally likely.
+# Distance of the rim's centre: every doubling of the distance equally likely.
 [distance]
 law = "log-uniform"
 low_m = {low:.15g}
