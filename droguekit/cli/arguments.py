@@ -72,7 +72,7 @@ DetectorOption = Annotated[
     typer.Option(
         "--detector",
         metavar="NAME|FILE.onnx",
-        help="A detector's name, or a network, perhaps with @HEIGHTxWIDTH of its input behind it; "
+        help="A detector's name, or a network, perhaps with @HEIGHTxWIDTH of its input behind it; mobile-s by default. "
         "docs/reference/detectors.md.",
     ),
 ]

@@ -28,7 +28,7 @@ EXAMPLES = {
         "droguekit detect photographs --mono --out boxes.json   (single pictures of any size)",
     ),
     "train": (
-        "droguekit train detector-small --out out/detector   (renders the recipe first)",
+        "droguekit train detector-small --out out/detector --variant s   (renders the recipe first)",
         "droguekit train data/mine data/more --out out/mine --variant s --image-passes 20000 --size 320x416",
         "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large in the last half)",
         "droguekit train data/mine --out out/mine --start-from mobile-s --image-passes 8000   (from shipped weights)",
@@ -118,10 +118,15 @@ def train(
         ),
     ],
     out: Annotated[Path, output_option("--out", "DIR", "The training's folder; made if missing.")],
-    variant: Annotated[Literal["l", "s"] | None, typer.Option("--variant", help="Large or small network.")] = None,
-    attention: Annotated[Literal["eca", "se"] | None, typer.Option("--attention", help="Channel attention.")] = None,
+    variant: Annotated[
+        Literal["l", "s"] | None,
+        typer.Option("--variant", help="Large or small network; l by default, s takes half the time."),
+    ] = None,
+    attention: Annotated[
+        Literal["eca", "se"] | None, typer.Option("--attention", help="Channel attention; eca by default.")
+    ] = None,
     fusion: Annotated[
-        Literal["asff", "concat"] | None, typer.Option("--fusion", help="Fusion of the three scales.")
+        Literal["asff", "concat"] | None, typer.Option("--fusion", help="Fusion of the three scales; asff by default.")
     ] = None,
     mosaic: Annotated[
         bool | None, typer.Option("--mosaic/--no-mosaic", help="Mosaic of four images; on by default.")
@@ -152,7 +157,8 @@ def train(
         typer.Option(
             "--start-from",
             metavar="NAME|FILE",
-            help="Initial weights: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training.",
+            help="Initial weights: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training. All but "
+            "the last also say variant, attention and fusion.",
         ),
     ] = None,
     photographs: Annotated[
