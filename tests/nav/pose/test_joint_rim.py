@@ -104,7 +104,7 @@ def test_exact_points_give_the_pose_without_its_roll(z_m: float, angles_deg: tup
 
 @pytest.mark.parametrize(("z_m", "error_m", "sd_m"), [(1.7, 1.1e-3, 2e-5), (2.8, 7e-4, 8e-5), (4.7, 4e-4, 2.8e-4)])
 def test_a_rim_that_is_drawn_flat_looks_farther_than_its_tube(z_m: float, error_m: float, sd_m: float) -> None:
-    """The analytic engine draws it so; docs/reference/methods.md has these figures."""
+    """The analytic engine draws it so; studies/acceptance/RESULTS.md has these figures."""
     rim, pose = marker_layout(load_drogue("red-8")).rim, make_pose(0.06, 0, z_m, 5.7, 2.9)
     assert rim is not None
     # Points 6 px apart, as the edge is measured.
