@@ -20,11 +20,11 @@ PACKAGES = SETTINGS["root_packages"]
 
 # Of each wall: a module and the import in it that must not pass.
 TRESPASSES = [
-    ("rooms", "geometry/trespass.py", "import drogue_models.parameters"),
-    ("rooms", "scenes/trespass.py", "import render.engine"),
-    ("rooms", "datasets_manifest/trespass.py", "import scenes.sampler"),
-    ("rooms", "labelgen/trespass.py", "import nav.runner"),
-    ("rooms", "droguekit/trespass.py", "import studies.acceptance.acceptance_table"),
+    ("packages", "geometry/trespass.py", "import drogue_models.parameters"),
+    ("packages", "scenes/trespass.py", "import render.engine"),
+    ("packages", "datasets_manifest/trespass.py", "import scenes.sampler"),
+    ("packages", "labelgen/trespass.py", "import nav.runner"),
+    ("packages", "droguekit/trespass.py", "import studies.acceptance.acceptance_table"),
     ("application", "droguekit/workflows/trespass.py", "import droguekit.cli.main"),
     ("application", "droguekit/scoring/trespass.py", "import droguekit.batch.worker_pool"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.scoring.pose_benchmark"),
