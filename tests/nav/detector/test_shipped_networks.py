@@ -17,9 +17,9 @@ from studies.detector_weights.corpora import CONES, FLAT, NEAR_CONES, ROUND
 
 NETWORKS = [name for name in detector_names() if network_file(name) is not None]
 ROOT = Path(__file__).parents[3]
-PAGE = ROOT / "docs/reference/detectors.md"
 # Those that do not ship with the package.
 STUDY = ROOT / "studies/detector_weights"
+RESULTS = STUDY / "RESULTS.md"
 RECIPES = {
     "detector-weights": (str(STUDY / "more-scenes.toml"), {}),
     "detector-missed": (str(STUDY / "missed-scenes.toml"), {}),
@@ -50,8 +50,8 @@ def test_a_network_says_where_it_comes_from(name: str) -> None:
     rendered = [corpus for corpus in corpora if corpus["name"] != "photographs"]
     assert corpora[0]["name"] == "detector-train"
     assert metadata.manifest_sha256 == (corpora[0]["manifest_sha256"] if len(rendered) == 1 else "")
-    # The page about the detectors names the corpora.
-    page = PAGE.read_text(encoding="utf-8")
+    # The results of the trainings name the corpora.
+    page = RESULTS.read_text(encoding="utf-8")
     assert all(corpus["name"] in page and corpus["dataset_sha256"] in page for corpus in corpora)
 
 
