@@ -41,16 +41,14 @@ def export_onnx(network: DetectorNetwork, path: Path, metadata: ModelMetadata) -
     Raises:
         OSError: the file cannot be written; the message names it. No partial file is left.
     """
-    model = onnx.load_from_string(_traced(network))
-    model.producer_name, model.producer_version = "droguekit", ""
-    onnx.helper.set_model_props(model, {METADATA_KEY: metadata.to_json()})
-    onnx.checker.check_model(model)
-    with open_bytes_atomic(path) as stream:
-        stream.write(model.SerializeToString())
+    write_onnx(trace_onnx(network), path, metadata)
 
 
-def _traced(network: DetectorNetwork) -> bytes:
-    """The network as ONNX, the images' gain and batch normalisation folded into the convolutions."""
+def trace_onnx(network: DetectorNetwork) -> onnx.ModelProto:
+    """The network as ONNX, the images' gain and batch normalisation folded into the convolutions.
+
+    Tracing takes seconds: one trace serves several files that differ in their metadata alone.
+    """
     still = copy.deepcopy(network).to("cpu", torch.float32).eval()
     still.fold_gain()
     buffer = io.BytesIO()
@@ -67,7 +65,21 @@ def _traced(network: DetectorNetwork) -> bytes:
             opset_version=_OPSET,
             dynamo=False,
         )
-    return buffer.getvalue()
+    model = onnx.load_from_string(buffer.getvalue())
+    model.producer_name, model.producer_version = "droguekit", ""
+    onnx.checker.check_model(model)
+    return model
+
+
+def write_onnx(model: onnx.ModelProto, path: Path, metadata: ModelMetadata) -> None:
+    """Write a traced network with its metadata, which replace the model's; the file appears by one rename.
+
+    Raises:
+        OSError: the file cannot be written; the message names it. No partial file is left.
+    """
+    onnx.helper.set_model_props(model, {METADATA_KEY: metadata.to_json()})
+    with open_bytes_atomic(path) as stream:
+        stream.write(model.SerializeToString())
 
 
 Convolution = nn.Conv1d | nn.Conv2d

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import onnx
 import torch
 
 from datasets_manifest.atomic import try_lock, write_text_atomic
@@ -30,7 +31,7 @@ from nav.training.evaluation import (
     statistics_batches,
 )
 from nav.training.hard_pairs import hard_pairs
-from nav.training.onnx_conversion import export_onnx, recalibrate_batch_norm
+from nav.training.onnx_conversion import recalibrate_batch_norm, trace_onnx, write_onnx
 from nav.training.trainer import NO_PAIRS, Trainer
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import TrainingSettings, size_text
@@ -208,8 +209,10 @@ class _Evaluator:
     observer: TrainingObserver
     should_stop: Callable[[], bool]
 
-    def evaluate(self, network: DetectorNetwork, step: int, file: Path, has_test: bool) -> TrainingResult:
-        """The threshold and the scores of the detector that a network is exported as.
+    def evaluate(
+        self, network: DetectorNetwork, step: int, file: Path, has_test: bool
+    ) -> tuple[TrainingResult, onnx.ModelProto]:
+        """The threshold and the scores of the detector that a network is exported as, and the model to export.
 
         Args:
             network: on the training's device; its batch statistics are measured.
@@ -221,9 +224,10 @@ class _Evaluator:
         exact = ComputeDevice(self.compute.device, bf16=False)
         measure_batch_statistics(network, self.corpus, self.settings.size_at(self.settings.steps - 1), exact)
         result = TrainingResult(file, step, None, None, DEFAULT_THRESHOLD, self.corpus.fault)
+        model = trace_onnx(network)
         with TemporaryDirectory() as folder:
             trial = Path(folder) / file.name
-            export_onnx(network, trial, _metadata(result, self.corpus, self.settings, network))
+            write_onnx(model, trial, _metadata(result, self.corpus, self.settings, network))
             detector = OnnxDetector(trial, threads=torch.get_num_threads())
         validation = self._detect(detector, "val")
         threshold = best_threshold(validation.truth, validation.found, DEFAULT_THRESHOLD)
@@ -232,12 +236,13 @@ class _Evaluator:
             # Which boxes are certain, and so not looked at again, depends on the threshold.
             validation = self._detect(detector, "val")
         test = self._detect(detector, "test") if has_test else Predictions([], [])
-        return replace(
+        scored = replace(
             result,
             validation=average_precision(validation.truth, validation.found),
             test=average_precision(test.truth, test.found),
             score_threshold=threshold,
         )
+        return scored, model
 
     def _detect(self, detector: OnnxDetector, split: SplitName) -> Predictions:
         def advance() -> None:
@@ -256,14 +261,14 @@ def _evaluate_and_export(out: Path, state: TrainingState, evaluator: _Evaluator)
     """Evaluate and export the best weights, and the last ones too."""
     corpus, settings = evaluator.corpus, evaluator.settings
     best_step, best = _best_network(out, settings, state)
-    result = evaluator.evaluate(best.to(evaluator.compute.device), best_step, out / ONNX_FILE, has_test=True)
+    result, model = evaluator.evaluate(best.to(evaluator.compute.device), best_step, out / ONNX_FILE, has_test=True)
     write_text_atomic(out / RESULT_FILE, json.dumps(_result_table(result, corpus, settings), indent=1) + "\n")
-    export_onnx(best, out / ONNX_FILE, _metadata(result, corpus, settings, best))
+    write_onnx(model, out / ONNX_FILE, _metadata(result, corpus, settings, best))
     last, of_last = best, result
     if state.step != best_step:
         last = state.average.network
-        of_last = evaluator.evaluate(last, state.step, out / LAST_ONNX_FILE, has_test=False)
-    export_onnx(last, out / LAST_ONNX_FILE, _metadata(of_last, corpus, settings, last))
+        of_last, model = evaluator.evaluate(last, state.step, out / LAST_ONNX_FILE, has_test=False)
+    write_onnx(model, out / LAST_ONNX_FILE, _metadata(of_last, corpus, settings, last))
     return result
 
 
