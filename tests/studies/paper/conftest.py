@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, RecipeSource
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 from tests.support.shared_folder import shared_folder
 
@@ -24,11 +23,17 @@ DOCKING_FRAMES = (0, 1, 2, 5, 200, 449, 450, 452)
 WriteEstimates = Callable[..., Path]
 
 
-def _render(folder: Path, recipe_name: str, frames: Iterable[int]) -> Path:
-    return _render_recipe(folder, open_recipe(recipe_name, None, "analytic"), frames)
+# A quarter of the pixels along each side, at the same field of view.
+_QUARTER_SIZE = {"width_px": 320, "height_px": 240, "focal_px": 533.0}
 
 
-def _render_recipe(folder: Path, source: RecipeSource, frames: Iterable[int]) -> Path:
+def _small(recipe_name: str, preset: str) -> RecipeSource:
+    """A shipped recipe with the analytic engine and small images by its rig's preset."""
+    changes = {"rig": _QUARTER_SIZE | {"preset": preset}, "render": {"engine": "analytic"}}
+    return load_recipe(recipe_name, changes=changes)
+
+
+def _render(folder: Path, source: RecipeSource, frames: Iterable[int]) -> Path:
     told = io.StringIO()
     summary = render_dataset(source, folder, list(frames), 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
@@ -38,17 +43,19 @@ def _render_recipe(folder: Path, source: RecipeSource, frames: Iterable[int]) ->
 @pytest.fixture(scope="session")
 def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight pairs of `docking-10m`; to be read only."""
-    return shared_folder(tmp_path_factory, "docking", lambda out: _render(out, "docking-10m", DOCKING_FRAMES))
+    return shared_folder(
+        tmp_path_factory, "docking", lambda out: _render(out, _small("docking-10m", "rgb-ideal"), DOCKING_FRAMES)
+    )
 
 
 @pytest.fixture(scope="session")
 def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four pairs of the docking scenes that follow no sequence, 0 and 2 without a drogue; to be read only."""
-    source = open_recipe("docking-10m", None, "analytic")
+    source = _small("docking-10m", "rgb-ideal")
     frames = source.recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5, "stream": ""})
     recipe = Recipe.model_validate(dict(source.recipe) | {"sequence": None, "frames": frames})
     single = RecipeSource(recipe, source.text)
-    folder = shared_folder(tmp_path_factory, "single", lambda out: _render_recipe(out, single, range(4)))
+    folder = shared_folder(tmp_path_factory, "single", lambda out: _render(out, single, range(4)))
     data = Dataset(folder)
     assert [data.record(k).left_from_drogue is None for k in range(4)] == [True, False, True, False]
     return folder
@@ -57,7 +64,9 @@ def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three pairs of `semi-physical-7`, at its first three stations; to be read only."""
-    return shared_folder(tmp_path_factory, "bench", lambda out: _render(out, "semi-physical-7", range(3)))
+    return shared_folder(
+        tmp_path_factory, "bench", lambda out: _render(out, _small("semi-physical-7", "paper-colour"), range(3))
+    )
 
 
 @pytest.fixture(scope="session")
