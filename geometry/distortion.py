@@ -15,12 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, log_twist, read_only
 
-_MAX_STEPS = 60
-_TOLERANCE = 1e-13
-# Near enough for Newton's method to go on without care; closer to the solution rounding moves the error up and down.
-_NEARLY = 1e-9
-# Shares of the way from the axis to a solution, on which no fold may lie; and steps of that way where one does.
-_WAY, _FOLLOWED_STEPS = (0.25, 0.5, 0.75), 64
 _BORDER_POINTS = 32
 # The field reaches beyond the image by so many times its width and height, the first with which the lens does not fold.
 _FIELD_MARGINS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.025, 0.0125, 0.0)
@@ -58,55 +52,18 @@ class BrownConrady:
         return self._distort(np.asarray(places, dtype=np.float64))[0]
 
     def undistort(self, places: ArrayLike) -> Array:
-        """(..., 2) ideal points of (..., 2) distorted ones, by Newton's method with halved steps, to rounding errors.
+        """(..., 2) ideal points of (..., 2) distorted ones, to rounding errors.
 
         Raises:
             ValueError: a point outside the region where the distortion is invertible.
         """
-        wanted = np.asarray(places, dtype=np.float64)
-        # Steps go from `last` along `step`: the first from the axis, where no lens folds, to the distorted points.
-        last, step = np.zeros_like(wanted), wanted.copy()
-        last_size = np.abs(wanted).max(axis=-1, initial=0.0)
-        for _ in range(_MAX_STEPS):
-            ideal = last + step
-            seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
-            error = wanted - seen
-            size = np.abs(error).max(axis=-1, initial=0.0)
-            if size.max(initial=0.0) < _TOLERANCE:
-                # A first step across two folds may have come to another branch of the polynomial.
-                ways = (self.stretch(share * ideal) > 0 for share in _WAY)
-                strayed = np.logical_or((ideal * wanted).sum(axis=-1) < 0, ~np.logical_and.reduce(list(ways)))
-                if strayed.any():
-                    ideal[strayed] = self._followed_from_axis(wanted[strayed])
-                return ideal
-            determinant = j_xx * j_yy - j_xy * j_yx
-            good = (determinant > 0) & ((size < last_size) | (size < _NEARLY))
-            newton = _newton_step(error, j_xx, j_xy, j_yx, j_yy, np.where(good, determinant, 1.0))
-            # A step across a fold, or one that leads away, is halved.
-            last, step = np.where(good[..., None], ideal, last), np.where(good[..., None], newton, step / 2)
-            last_size = np.where(good, size, last_size)
-        raise self.fold_error()
+        from geometry.distortion_loops import undistort_points
 
-    def _followed_from_axis(self, wanted: Array) -> Array:
-        """(N, 2) ideal points of (N, 2) distorted ones, followed from the axis in small steps.
-
-        Raises:
-            ValueError: the way meets a fold.
-        """
-        ideal = np.zeros_like(wanted)
-        for share in np.linspace(0.0, 1.0, _FOLLOWED_STEPS + 1)[1:]:
-            for _ in range(_MAX_STEPS):
-                seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
-                error = share * wanted - seen
-                determinant = j_xx * j_yy - j_xy * j_yx
-                if not (determinant > 0).all():
-                    raise self.fold_error()
-                if np.abs(error).max() < _TOLERANCE:
-                    break
-                ideal += _newton_step(error, j_xx, j_xy, j_yx, j_yy, determinant)
-            else:
-                raise self.fold_error()
-        return ideal
+        wanted = np.array(places, dtype=np.float64, order="C")
+        ideal, are_found = undistort_points(wanted.reshape(-1, 2), *self._model())
+        if not are_found:
+            raise self.fold_error()
+        return ideal.reshape(wanted.shape)
 
     def slopes(self, places: ArrayLike) -> Array:
         """(..., 2, 2) derivative of `distort` at (..., 2) ideal points."""
@@ -128,21 +85,15 @@ class BrownConrady:
 
     def _distort(self, p: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Distorted points, and the entries xx, xy, yx, yy of their Jacobian."""
-        x, y = p[..., 0], p[..., 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
-        seen = np.stack(
-            [
-                x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
-                y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y,
-            ],
-            axis=-1,
-        )
-        j_xx = radial + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
-        j_xy = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
-        j_yy = radial + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
-        return seen, j_xx, j_xy, j_xy, j_yy
+        # The compiler takes a second to load, and rigs without lenses do not need it.
+        from geometry.distortion_loops import distort_points
+
+        found = distort_points(np.array(p, order="C").reshape(-1, 2), *self._model()).reshape(*p.shape[:-1], 6)
+        return found[..., :2], found[..., 2], found[..., 3], found[..., 4], found[..., 5]
+
+    def _model(self) -> tuple[Array, Array]:
+        """(14,) coefficients in OpenCV's order, and (3, 3) homography from the plane across the axis to the sensor."""
+        return np.append(self.coefficients(), np.zeros(9)), np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -174,38 +125,8 @@ class OpenCvDistortion(BrownConrady):
         """(14,) k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y."""
         return np.array([getattr(self, one.name) for one in fields(self)])
 
-    def _distort(self, p: Array) -> tuple[Array, Array, Array, Array, Array]:
-        x, y = p[..., 0], p[..., 1]
-        r2 = x * x + y * y
-        numerator = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        denominator = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
-        radial = numerator / denominator
-        # Derivatives by the square of the distance.
-        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
-        slope = (slope - radial * (self.k4 + r2 * (2.0 * self.k5 + r2 * 3.0 * self.k6))) / denominator
-        prism_x, prism_y = self.s1 + 2.0 * self.s2 * r2, self.s3 + 2.0 * self.s4 * r2
-        seen_x = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + r2 * (self.s1 + self.s2 * r2)
-        seen_y = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y + r2 * (self.s3 + self.s4 * r2)
-        cross = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
-        j_xx = radial + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + 2.0 * x * prism_x
-        j_xy = cross + 2.0 * y * prism_x
-        j_yx = cross + 2.0 * x * prism_y
-        j_yy = radial + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x + 2.0 * y * prism_y
-        if self.tau_x == 0 == self.tau_y:
-            return np.stack([seen_x, seen_y], axis=-1), j_xx, j_xy, j_yx, j_yy
-        h = self._tilt()
-        w = h[2, 0] * seen_x + h[2, 1] * seen_y + h[2, 2]
-        u = (h[0, 0] * seen_x + h[0, 1] * seen_y + h[0, 2]) / w
-        v = (h[1, 0] * seen_x + h[1, 1] * seen_y + h[1, 2]) / w
-        u_x, u_y = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
-        v_x, v_y = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
-        return (
-            np.stack([u, v], axis=-1),
-            u_x * j_xx + u_y * j_yx,
-            u_x * j_xy + u_y * j_yy,
-            v_x * j_xx + v_y * j_yx,
-            v_x * j_xy + v_y * j_yy,
-        )
+    def _model(self) -> tuple[Array, Array]:
+        return self.coefficients(), self._tilt()
 
     def _tilt(self) -> Array:
         """(3, 3) homography from the plane across the axis to the tilted one."""
@@ -348,17 +269,6 @@ def _out_of_image(camera: PinholeCamera, pixels: Array) -> Array:
     share = np.divide(ends, away, out=np.full_like(away, np.inf), where=away != 0).min(axis=-1, keepdims=True)
     moved: Array = center + share * away
     return moved
-
-
-def _newton_step(error: Array, j_xx: Array, j_xy: Array, j_yx: Array, j_yy: Array, determinant: Array) -> Array:
-    """(..., 2) solution of the Jacobian's equations for (..., 2) errors."""
-    return np.stack(
-        [
-            (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant,
-            (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant,
-        ],
-        axis=-1,
-    )
 
 
 def _with_one(places: Array) -> Array:

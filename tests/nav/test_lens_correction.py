@@ -20,7 +20,7 @@ from nav.pair_navigator import PairNavigator
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import build_recipe, stations
+from tests.support.recipe_builder import PLAIN_SKY, build_recipe, stations
 
 DISCS = 5.0 * np.stack([np.eye(2)] * 2)
 RIG, _ = resolve_rig("paper-real", 3)
@@ -73,7 +73,7 @@ def test_poses_through_real_lenses() -> None:
         rig="paper-real",
         frames={"count": 10},
         distance=stations(2.0, 6.0),
-        environment={"sun_elevation_deg": [30, 60], "sun_azimuth_deg": [120, 240]},
+        environment=PLAIN_SKY,
         render={"engine": "analytic"},
     )
     engine, navigator = load_engine("analytic"), PairNavigator(recipe.rig, recipe.drogue)
