@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.types.estimates import read_estimates
+from datasets_manifest.types.estimates import read_estimates, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import WRONG_INPUT
-from nav.runner import method_names
+from nav.runner import method_names, navigate
 from studies.acceptance import acceptance_table
 from studies.acceptance.__main__ import (
     AcceptanceOptions,
@@ -30,6 +31,7 @@ from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, a
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 from tests.support.recipe_builder import RIG_320_PX, recipe_text
+from tests.support.small_datasets import rendered
 
 RECIPE = recipe_text(
     name="small-flights",
@@ -107,12 +109,12 @@ def test_flights_are_rendered_navigated_and_judged(measured: tuple[Path, FlightD
     assert beside.bar == "beside" and beside.measured is not None
 
 
-def test_scores_are_those_of_the_records(measured: tuple[Path, FlightData, list[AcceptanceRow]]) -> None:
-    folder, _, _ = measured
-    made = folder / "out" / "analytic" / "small-flights"
-    frames = Dataset(made / "dataset")
-    scores = score_pairs(made / "dataset", made / "estimates.jsonl")
-    estimates = {e.frame_index: e for e in read_estimates(made / "estimates.jsonl") if e.method == BEST}
+def test_scores_are_those_of_the_records(tmp_path: Path) -> None:
+    dataset, file = rendered(RECIPE, tmp_path / "dataset"), tmp_path / "estimates.jsonl"
+    estimates = {estimate.frame_index: estimate for estimate in navigate(BlindDataset(dataset), [BEST])}
+    write_estimates(file, estimates.values())
+    frames, scores = Dataset(dataset), score_pairs(dataset, file)
+    assert len(scores[BEST]) == 20
     for scored in scores[BEST]:
         record, estimate = frames.record(scored.pair.frame_index), estimates[scored.pair.frame_index]
         features = [(*view.markers, view.hub) for view in (record.views.left, record.views.right)]
