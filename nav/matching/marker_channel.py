@@ -119,7 +119,7 @@ def marker_channel(
         # Whole cells, and one more on each side, so that the interpolation equals that of the whole mosaic.
         low_x, low_y = max(0, left // 2 * 2 - 2), max(0, top // 2 * 2 - 2)
         cells = mosaic[low_y : bottom // 2 * 2 + 4, low_x : right // 2 * 2 + 4]
-        channel = _from_mosaic(cells, color, others_weight)
+        channel = _from_mosaic(cells, color, others_weight, round(images.black_level_dn))
         return np.asarray(channel[top - low_y : bottom - low_y, left - low_x : right - low_x])
     linear = _linear(image[top:bottom, left:right], images)
     if linear.ndim == 2:
@@ -176,11 +176,12 @@ def balancing_weight(images: StereoImages, color: int, middles_px: Array, rim_px
     return float(np.clip(own / others, *_WEIGHTS)) if others > 0 else usual
 
 
-def _color_excess(own: Pixels, others: Pixels, others_weight: float) -> Pixels:
-    """`max(own - weight others, 0)` in the integers of the image."""
+def _color_excess(own: Pixels, others: Pixels, others_weight: float, black_dn: int = 0) -> Pixels:
+    """`max(own - weight others, 0)` in the integers of the image, of the light above a black level in both."""
     if others_weight == PLAIN:
         return np.asarray(cv2.subtract(own, others))
-    weighted = np.minimum(others * np.float32(others_weight), np.iinfo(own.dtype).max)
+    light = np.maximum(others, black_dn) - black_dn
+    weighted = np.minimum(light * np.float32(others_weight) + black_dn, np.iinfo(own.dtype).max)
     return np.asarray(cv2.subtract(own, weighted.astype(own.dtype)))
 
 
@@ -252,7 +253,7 @@ def _srgb_to_linear(
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
+def _from_mosaic(mosaic: Pixels, color: int, others_weight: float, black_dn: int) -> Pixels:
     """Colour difference within each RGGB cell, interpolated bilinearly from the colour's sites to the full grid.
 
     It is zero at a red or blue site that does not exceed the other colours' sites around it as well. Before a bright
@@ -264,12 +265,11 @@ def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
     green = cv2.addWeighted(first_green, 0.5, second_green, 0.5, 0)
     planes = (np.ascontiguousarray(even[0::2, 0::2]), green, np.ascontiguousarray(even[1::2, 1::2]))
     first, second = (planes[index] for index in range(3) if index != color)
-    difference = _color_excess(planes[color], cv2.max(first, second), others_weight)
+    difference = _color_excess(planes[color], cv2.max(first, second), others_weight, black_dn)
     if color != _GREEN:
         beside = _brightest_beside((planes[0], first_green, second_green, planes[2]), color)
-        difference = np.where(
-            _color_excess(planes[color], beside, others_weight) > 0, difference, difference.dtype.type(0)
-        )
+        exceeds = _color_excess(planes[color], beside, others_weight, black_dn) > 0
+        difference = np.where(exceeds, difference, difference.dtype.type(0))
     shift = -_SITE_OFFSET_PX[color] / 2
     full_to_site = np.array([[0.5, 0.0, shift], [0.0, 0.5, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

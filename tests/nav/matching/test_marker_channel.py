@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from datasets_manifest.types.images import StereoImages
-from nav.matching.marker_channel import PLAIN, balancing_weight, marker_channel
+from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, balancing_weight, marker_channel
 
 MIDDLES_PX = np.array([[60.0, 50.0], [58.0, 50.0]])
 RIM_PX = 12.0
@@ -83,3 +85,20 @@ def test_the_edge_of_a_bright_sky_leads_nowhere_in_a_mosaic(color: int, turn: in
     images = StereoImages(blank, blank, 0.0, 1e-3, left_mosaic=mosaic, right_mosaic=mosaic)
     # Sites of one cell differ by up to 40 numbers there.
     assert marker_channel(images, "left", color).max() == 0
+
+
+@pytest.mark.parametrize("weight", OTHERS_WEIGHTS)
+@pytest.mark.parametrize("color", [0, 1, 2])
+def test_a_mosaic_shows_what_its_picture_shows(color: int, weight: float) -> None:
+    """Of even patches, so that the sites of a cell tell the picture's colour; black is not subtracted with the rest."""
+    patches = np.random.default_rng(6).integers(0, 61, (2, 2, 3)) + 168
+    patches[0, 0, color] += 500
+    picture = np.kron(patches, np.ones((20, 20, 1))).astype(np.uint16)
+    mosaic = picture[..., 1].copy()
+    mosaic[0::2, 0::2], mosaic[1::2, 1::2] = picture[0::2, 0::2, 0], picture[1::2, 1::2, 2]
+    images = StereoImages(picture, picture, 0.0, 1e-3, bits=12, black_level_dn=168.0)
+    raw = replace(images, left_mosaic=mosaic, right_mosaic=mosaic)
+    middles = np.s_[9::20, 9::20]
+    seen = marker_channel(raw, "left", color, weight)[middles]
+    assert seen[0, 0] > 400
+    np.testing.assert_array_equal(seen, marker_channel(images, "left", color, weight)[middles])
