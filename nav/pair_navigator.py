@@ -234,8 +234,12 @@ class PairNavigator:
         rig, rim, regions = self._rig, self._layout.rim, measurement.regions
         stage_s = {stage: s for stage, s in measurement.stage_s.items() if stage == "detect"}
         fault = self._unusable(images)
-        if fault is not None or not regions:
-            return PairMeasurement(fault or NOT_DETECTED, stage_s)
+        if fault is None and not regions:
+            seen = measurement.observation
+            # A drogue without markers is no reason here.
+            fault = seen if isinstance(seen, NoFixReason) and seen != too_few_markers(self._layout) else NOT_DETECTED
+        if fault is not None:
+            return PairMeasurement(fault, stage_s)
         start = perf_counter()
         edges = None
         if rim is not None and rim.is_known:

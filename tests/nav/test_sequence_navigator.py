@@ -229,6 +229,19 @@ def test_another_drogue_begins_another_sequence(steady: list[BlindPair]) -> None
     assert [navigator.measure(pair).begins for pair in pairs] == [True, False, True]
 
 
+class BrokenDetector(ColorBlobDetector):
+    """Has no run time."""
+
+    def detect(self, images: StereoImages) -> StereoDetection:
+        raise RuntimeError("the run time of the network failed")
+
+
+def test_a_fault_is_the_reason_by_every_method(steady: list[BlindPair]) -> None:
+    answers = SequenceNavigator(SequenceSettings(("joint", "joint-rim")), BrokenDetector).process(steady[0])
+    assert answers.fault == "internal fault, RuntimeError: the run time of the network failed"
+    assert [estimate.reason for estimate in answers.estimates] == 2 * [answers.fault]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
