@@ -28,6 +28,13 @@ from nav.tracking.tracker import REDETECT_EVERY, Tracker, begins_sequence, is_sa
 # and every third one after it, since the drogue may be out of one view for long.
 _FIRST_RETRY, _RETRY_EVERY = 2, 3
 _NOWHERE = StereoDetection(None, None)
+# Shape, bits and encoding.
+_ImageKind = tuple[tuple[int, ...], int, str]
+
+
+def _image_kind(images: StereoImages) -> _ImageKind:
+    """The format of images; the appearance learned from one does not apply to another."""
+    return images.left.shape, images.bits, images.encoding
 
 
 class TrackedDetector:
@@ -44,15 +51,14 @@ class TrackedDetector:
         self.name = f"{detector.name}+{tracker.name}"
         self._detector, self._tracker = detector, tracker
         self._time_s: float | None = None
-        self._image_kind: tuple[object, ...] = ()
+        self._image_kind: _ImageKind | None = None
         self._is_following = False
         self._misses: dict[Eye, int] = {}
         self._since_detection = 0
 
     def detect(self, images: StereoImages) -> StereoDetection:
         """Boxes in the next pair."""
-        # Appearance learned from images of one format does not apply to another.
-        image_kind = (images.left.shape, images.bits, images.encoding)
+        image_kind = _image_kind(images)
         if begins_sequence(self._time_s, images.time_s) or image_kind != self._image_kind:
             self._is_following = False
         self._time_s, self._image_kind = images.time_s, image_kind
@@ -125,8 +131,9 @@ class TrackedObserver:
     """Measures the pairs of one sequence after the other, with one drogue and one rig.
 
     For each pair the tracker gets the drogue's rim as a filter of the rough poses predicts it, and afterwards the rim
-    by the pair's own rough pose. The detector runs when no drogue is tracked, when an eye that should see the drogue
-    has lost it, when the tracker's boxes show no ring of markers, and at every N-th tracked pair.
+    by the pair's own rough pose. The detector runs when no drogue is tracked, when the images have another format, when
+    an eye that should see the drogue has lost it, when the tracker's boxes show no ring of markers, and at every N-th
+    tracked pair.
     """
 
     def __init__(
@@ -151,6 +158,7 @@ class TrackedObserver:
         self._rig, self._rim_radius_m = rig, drogue.rim_radius_m
         self._redetect_every = redetect_every
         self._filter = PoseFilter(settings, marker_layout(drogue).symmetry_order)
+        self._image_kind: _ImageKind | None = None
         self._is_following = False
         self._since_detection = 0
 
@@ -161,6 +169,9 @@ class TrackedObserver:
 
     def observe(self, images: StereoImages) -> PairMeasurement:
         """Measure the markers of the next pair in time."""
+        image_kind = _image_kind(images)
+        if image_kind != self._image_kind:
+            self._image_kind, self._is_following = image_kind, False
         if not self._is_following:
             measurement = self._navigator.observe(images)
             return self._updated(images, measurement, True)

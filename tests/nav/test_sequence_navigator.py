@@ -124,6 +124,32 @@ def test_a_hidden_drogue_has_no_pose_and_is_found_again(
         assert np.rint(25 * np.array(detector.shown_s)).tolist() == [0, *HIDDEN, HIDDEN.stop]
 
 
+def with_left_half(pair: BlindPair) -> BlindPair:
+    left, right = (image[:, :320] for image in (pair.images.left, pair.images.right))
+    return replace(pair, images=replace(pair.images, left=left, right=right))
+
+
+def in_grey(pair: BlindPair) -> BlindPair:
+    left, right = (np.ascontiguousarray(image[..., 0]) for image in (pair.images.left, pair.images.right))
+    return replace(pair, images=replace(pair.images, left=left, right=right))
+
+
+@pytest.mark.parametrize("tracker", tracker_names())
+def test_a_tracker_starts_anew_where_images_have_other_planes(steady: list[BlindPair], tracker: str) -> None:
+    pairs = [*map(in_grey, steady[:2]), *steady[2:4], *map(in_grey, steady[4:6])]
+    found, _ = answers_by_method(pairs, SequenceSettings(("joint",), tracker=tracker))
+    assert [sources(estimate) for estimate in found["joint"]] == 3 * [{"detector"}, {tracker}]
+    assert all(isinstance(estimate, PoseEstimate) for estimate in found["joint"])
+
+
+@pytest.mark.parametrize("tracker", tracker_names())
+def test_a_tracker_never_sees_an_image_of_another_size(steady: list[BlindPair], tracker: str) -> None:
+    pairs = [*steady[:2], with_left_half(steady[2]), steady[3]]
+    found, _ = answers_by_method(pairs, SequenceSettings(("joint",), tracker=tracker))
+    assert found["joint"][2].reason == "the images are 320x480 px, the rig's 640x480 px"
+    assert [isinstance(estimate, PoseEstimate) for estimate in found["joint"]] == [True, True, False, True]
+
+
 class TightTracker:
     """Returns boxes at the right place, so tight that they cut the markers off."""
 
