@@ -19,7 +19,7 @@ from nav.matching.marker_channel import Blobs
 from nav.pair_navigator import PairNavigator, correspond
 from nav.pose.joint import joint
 from nav.pose.pose_method import NoFixReason, Observation, Solution
-from tests.support.painted_pairs import make_pose, paint_pair
+from tests.support.painted_pairs import FLIGHT_RIG, make_pose, paint_pair
 
 DROGUE = PRESETS["red-8"]
 LAYOUT = marker_layout(DROGUE)
@@ -69,6 +69,23 @@ def test_pixels_that_are_not_square_measure_as_well_without_lenses(stretch: floa
     eyes = StereoRig(camera, PLAIN.baseline_m)
     images = paint_pair(eyes, DROGUE, make_pose(0.05, -0.04, z_m, 6, -7, 12), np.random.default_rng(4))
     assert_alike(eyes, described(eyes, 1.0), images)
+
+
+@pytest.mark.parametrize("stretch", [0.8, 1.25])
+@pytest.mark.parametrize("z_m", [2.5, 8.0])
+def test_pixels_that_are_not_square_show_the_true_pose(stretch: float, z_m: float) -> None:
+    own = FLIGHT_RIG.camera
+    camera = PinholeCamera(own.width_px, own.height_px, own.fx_px, stretch * own.fx_px, own.cx_px, own.cy_px)
+    rig = StereoRig(camera, FLIGHT_RIG.baseline_m)
+    place = make_pose(0.1, -0.05, z_m, 5, -8, 11)
+    (found,) = PairNavigator(rig, DROGUE).estimate(
+        0, paint_pair(rig, DROGUE, place, np.random.default_rng(3)), ["joint"]
+    )
+    assert isinstance(found, PoseEstimate)
+    assert found.covariance is not None
+    off_m = found.left_from_drogue.translation_m - place.translation_m
+    # Five of the deviations that it states.
+    assert (np.abs(off_m) < 5 * np.sqrt(np.diag(found.covariance)[:3])).all()
 
 
 def test_a_rig_of_tall_pixels_is_no_wrong_rig() -> None:

@@ -65,8 +65,8 @@ def paint_disc(
     offset = np.array([0.0 if eye == "left" else rig.baseline_m, 0.0, 0.0])
     origin = place.rotation @ np.asarray(center) + place.translation_m - offset
     inner, outer = edges
-    u, v = camera.fx_px * origin[:2] / origin[2] + (camera.cx_px, camera.cy_px)
-    reach = 1.2 * camera.fx_px * outer / origin[2] + 3
+    u, v = np.array([camera.fx_px, camera.fy_px]) * origin[:2] / origin[2] + (camera.cx_px, camera.cy_px)
+    reach = 1.2 * max(camera.fx_px, camera.fy_px) * outer / origin[2] + 3
     left, right = max(0, int(u - reach)), min(camera.width_px, int(u + reach) + 1)
     top, bottom = max(0, int(v - reach)), min(camera.height_px, int(v + reach) + 1)
     if left >= right or top >= bottom:
