@@ -242,7 +242,7 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     The solution is that of `joint-hub` (or `joint`, where no hub was measured) without them. An edge of the hub counts
     as a feature.
     """
-    reason = stereo_fault(observation) or hub_fault(observation)
+    reason = stereo_fault(observation, allows_outliers=True) or hub_fault(observation)
     if reason is not None:
         return reason
     features = observed_features(observation, with_hub=True)

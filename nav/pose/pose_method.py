@@ -211,12 +211,17 @@ _ASYMMETRY = 1e-6
 _RIG_MISMATCH_FRACTION, _RIG_MISMATCH_PX = 0.35, 1.0
 
 
-def stereo_fault(observation: Observation) -> NoFixReason | None:
-    """Why no pose can be computed from the markers in both eyes; None when one can."""
+def stereo_fault(observation: Observation, allows_outliers: bool = False) -> NoFixReason | None:
+    """Why no pose can be computed from the markers in both eyes; None when one can.
+
+    Args:
+        observation: the markers.
+        allows_outliers: whether a few markers may be wrong, as the method finds them.
+    """
     return (
         _invalid_numbers(observation, observation.pixels_px, observation.cov_px2, "marker")
         or _too_few_pairs(observation)
-        or _degenerate_pairs(observation)
+        or _degenerate_pairs(observation, allows_outliers)
         or _rig_mismatch(observation)
     )
 
@@ -278,13 +283,13 @@ def _too_few_pairs(observation: Observation) -> NoFixReason | None:
     return None
 
 
-def _degenerate_pairs(observation: Observation) -> NoFixReason | None:
+def _degenerate_pairs(observation: Observation, allows_outliers: bool) -> NoFixReason | None:
     paired = observation.paired
     for points in (observation.layout.centers_m[paired, :2], *observation.pixels_px[:, paired]):
         if _is_collinear(points):
             return NoFixReason("the markers that both eyes see lie on one line")
     disparity_px = observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]
-    if disparity_px.min() <= 0:
+    if (median(disparity_px) if allows_outliers else disparity_px.min()) <= 0:
         return NoFixReason("a marker's disparity is not positive")
     return None
 

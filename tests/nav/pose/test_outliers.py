@@ -97,6 +97,18 @@ def test_the_inlier_mask_excludes_the_outlier() -> None:
         assert solution.used_hub.all()
 
 
+@pytest.mark.parametrize("z_m", [30.0, 40.0])
+def test_an_outlier_with_a_negative_disparity_ends_nothing(z_m: float) -> None:
+    draws = draw_poses(np.random.default_rng(45), 6, z_m, 0.05)
+    for index in range(6):
+        pixels = draws.pixels_px[index].copy()
+        # Of 6 to 9 px.
+        pixels[0, index] -= (10.0, 0.0)
+        solution = joint_robust(draws.observation(index, pixels_px=pixels))
+        assert isinstance(solution, Solution), solution.reason
+        assert np.flatnonzero(~solution.used.all(axis=0)).tolist() == [index]
+
+
 def test_a_wrong_hub_is_an_outlier() -> None:
     draws = draw_poses(np.random.default_rng(34), 10, 5.0, 0.05, tilt_deg=(6.0, 10.0))
     for index in range(10):
