@@ -26,7 +26,8 @@ _MOST_DN_OF_8_BITS = 255
 class Navigator:
     """Estimates the pose of one drogue with one rig, pair by pair.
 
-    Without a tracker and a filter each pair is estimated by itself; with either, pairs must come in the order of time.
+    Without a tracker and a filter each pair is estimated by itself, unless its lamps blink: these are followed from
+    pair to pair for the roll. With any of the three, pairs must come in the order of time.
 
     Examples:
         >>> navigator = droguekit.Navigator(dataset.rig, dataset.drogue)
@@ -85,15 +86,18 @@ class Navigator:
         Args:
             left: (H, W, 3) in the order red, green, blue, or (H, W); uint8, or 12 significant bits in uint16.
             right: as `left`.
-            time_s: mid-exposure; without it pairs are 0.04 s apart. [s]
+            time_s: mid-exposure; without it pairs are 0.04 s apart. A drogue whose lamps blink needs it, on the clock
+                of its `marker_code`. [s]
 
         Returns:
             A `PoseEstimate`, or a `NoFix` with the reason.
 
         Raises:
             ValueError: arrays of another type, of different shapes, or with more than 12 bits, a black level beyond
-                their largest number, or a time that is no finite number.
+                their largest number, a time that is no finite number, or none where lamps blink.
         """
+        if time_s is None and self.drogue.marker_code is not None:
+            raise ValueError("time_s: a drogue whose lamps blink needs the time of the images, got None")
         if time_s is not None and not math.isfinite(time_s):
             raise ValueError(f"time_s: must be a finite number, got {time_s}")
         if left.dtype == "uint8" and self._black_level_dn > _MOST_DN_OF_8_BITS:

@@ -11,6 +11,9 @@ import pytest
 import droguekit
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.types.estimates import Estimate
+from drogue_models.parameters import MarkerCode
+from drogue_models.presets import PRESETS
+from geometry.stereo import paper_rig
 from nav.runner import navigate
 
 
@@ -76,6 +79,17 @@ def test_a_time_that_is_no_number_is_refused(time_s: float, tracker: str | None,
         navigator(empty, empty, time_s=time_s)
     # The pair does not count.
     assert navigator(empty, empty, time_s=1.0).frame_index == 0
+
+
+def test_blinking_lamps_need_the_time() -> None:
+    """Their code is in the time of the pair, and a made-up one tells a wrong roll."""
+    code = MarkerCode(slot_s=0.04, patterns=("01111111",))
+    blinking = PRESETS["red-8"].model_copy(update={"marker_luminance_cd_m2": 2e4, "marker_code": code})
+    navigator = droguekit.Navigator(paper_rig(), blinking, detector="color-blob")
+    dark = np.zeros((960, 1280, 3), np.uint8)
+    with pytest.raises(ValueError, match=r"^time_s: a drogue whose lamps blink needs the time of the images"):
+        navigator(dark, dark)
+    assert navigator(dark, dark, time_s=1.0).frame_index == 0
 
 
 def test_a_black_level_that_8_bits_do_not_reach_is_refused(smoke_dataset: Path) -> None:
