@@ -435,6 +435,8 @@ class _Stages:
 
     def _measure(self, late: tuple[int, ...], arrival: ArrivedPair) -> _MeasuredPair:
         started_s = self._clock.now_s()
+        if not self._unreadable.keys().isdisjoint(late):
+            self._navigator.restart()
         pair = self._navigator.measure(arrival.pair)
         return _MeasuredPair(late, arrival, pair, started_s, finished_s=self._clock.now_s())
 

@@ -116,6 +116,7 @@ def process_dataset(dataset: BlindDataset, navigator: SequenceNavigator) -> Gene
         try:
             pair = dataset.pair(index)
         except ValueError as error:
+            navigator.restart()
             yield SkippedPair(index, unreadable_reason(index, error))
         else:
             yield navigator.process(pair)

@@ -9,7 +9,7 @@ exception as the reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 from datasets_manifest.storage.blind import BlindPair
@@ -128,8 +128,9 @@ class SkippedPair:
 class SequenceNavigator:
     """Processes pairs in two stages, `measure` and `estimate`.
 
-    Each stage needs the pairs in their order. `measure` does not depend on what `estimate` did with earlier pairs, so
-    the two stages may run at the same time on different pairs.
+    Each stage needs the pairs in their order. Without a tracker, `measure` does not depend on what `estimate` did with
+    earlier pairs, so the two stages may run at the same time on different pairs. A tracker starts anew where `estimate`
+    fails.
     """
 
     def __init__(self, settings: SequenceSettings, make_detector: Callable[[DrogueParameters], Detector]) -> None:
@@ -147,6 +148,7 @@ class SequenceNavigator:
         self._observer: TrackedObserver | None = None
         self._filters: dict[str, PoseFilter] = {}
         self._roll_decoder: RollDecoder | None = None
+        self._has_failed = False
 
     @property
     def detects_every_pair(self) -> bool:
@@ -156,6 +158,10 @@ class SequenceNavigator:
     def process(self, pair: BlindPair) -> PairEstimates:
         """Run both stages on the next pair."""
         return self.estimate(self.measure(pair))
+
+    def restart(self) -> None:
+        """Begin a new sequence with the next pair to measure, as after a pair that cannot be read."""
+        self._last_s = None
 
     def measure(self, pair: BlindPair) -> MeasuredPair:
         """Find the drogue in the next pair, and measure its markers roughly."""
@@ -175,20 +181,22 @@ class SequenceNavigator:
         except Exception as error:
             fault = fault_reason(pair.frame_index, error)
         # The tracker may have learnt half of the pair, so the next one begins anew.
-        self._last_s = None
-        if self._observer is not None:
-            self._observer.reset()
+        self.restart()
         return MeasuredPair(pair, self._navigator, PairMeasurement(NoFixReason(fault), {}), begins, fault)
 
     def estimate(self, measured: MeasuredPair) -> PairEstimates:
         """Estimate the pose by every method, and its motion."""
         pair, settings, fault = measured.pair, self._settings, measured.fault
+        if self._has_failed:
+            measured, self._has_failed = replace(measured, begins=True), False
         try:
             estimates, filtered = self._estimate_all(measured)
         except Exception as error:
             fault = fault_reason(pair.frame_index, error)
             # A filter may have taken half of the pair, so the next one begins anew.
-            self._filters, self._roll_decoder = {}, None
+            self._has_failed = True
+            if self._tracker is not None:
+                self.restart()
             estimates = _without_fix(pair, settings.methods, fault)
             names = [name + FILTER_SUFFIX for name in settings.methods] if settings.filtered else []
             filtered = _without_fix(pair, names, fault)

@@ -17,7 +17,8 @@ from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.detector import StereoDetection
 from nav.detector.ring_detectors import ColorBlobDetector
-from nav.realtime import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
+from nav.pair_navigator import PairNavigator
+from nav.realtime import ArrivedPair, LatestItemQueue, MonotonicClock, SingleItemQueue, process_arrivals, replay
 from nav.runner import LATE, add_smoothed, open_navigator
 from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair
 from tests.support.painted_pairs import fly_past
@@ -203,6 +204,50 @@ def test_an_unreadable_pair_is_told_and_ends_nothing(pairs: list[BlindPair], dam
     assert [each.frame_index for each in answers if each.fault == message] == [damaged]
     told = [e.frame_index for e in add_smoothed(answers, settings) if isinstance(e, NoFix) and e.reason == message]
     assert told == [damaged]
+
+
+class InTurn:
+    """A source whose next pair arrives when the last one is answered; one pair cannot be read."""
+
+    def __init__(self, pairs: list[BlindPair], damaged: int) -> None:
+        self._pairs, self._damaged = pairs, damaged
+        self.answered = threading.Semaphore(0)
+
+    def arrivals(self) -> Iterator[ArrivedPair | SkippedPair]:
+        for pair in self._pairs:
+            if pair.frame_index == self._damaged:
+                yield SkippedPair(pair.frame_index, "the PNG is truncated")
+            else:
+                yield ArrivedPair(pair, arrived_s=0.0, read_s=0.0)
+                self.answered.acquire(timeout=PATIENCE_S)
+
+    def stop(self) -> None:
+        self.answered.release()
+
+
+@pytest.mark.parametrize("tracker", [None, "flow"])
+@pytest.mark.parametrize("stage", ["read", "estimate"])
+def test_a_bad_pair_ends_the_sequence(
+    pairs: list[BlindPair], stage: str, tracker: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = PairNavigator.estimate_measured
+
+    def fails(self: PairNavigator, frame_index: int, *args: Any) -> Any:
+        if frame_index == 2:
+            raise RuntimeError("half of the pair is done")
+        return work(self, frame_index, *args)
+
+    if stage == "estimate":
+        monkeypatch.setattr(PairNavigator, "estimate_measured", fails)
+    source = InTurn(pairs[:5], 2 if stage == "read" else -1)
+    navigator = open_navigator(SequenceSettings(("constant",), tracker=tracker), "color-blob")
+    begins = {}
+    for each in process_arrivals(source, navigator, MonotonicClock()):
+        if isinstance(each, PairEstimates):
+            source.answered.release()
+            if each.fault is None:
+                begins[each.frame_index] = each.begins
+    assert begins == {0: True, 1: False, 3: True, 4: False}
 
 
 class FaultyDetector(ColorBlobDetector):

@@ -19,7 +19,7 @@ from nav.detector.detector import Detection, StereoDetection
 from nav.detector.ring_detectors import ColorBlobDetector
 from nav.filtering.motion_model import FilterSettings
 from nav.pair_navigator import PairNavigator
-from nav.runner import add_smoothed, open_navigator
+from nav.runner import add_smoothed, open_navigator, process_dataset
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
 from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import tracker_names
@@ -253,6 +253,47 @@ def test_another_drogue_begins_another_sequence(steady: list[BlindPair]) -> None
     pairs = [*steady[:2], replace(steady[2], drogue=smaller)]
     navigator = open_navigator(SequenceSettings(("constant",), tracker="bernoulli"), DETECTOR)
     assert [navigator.measure(pair).begins for pair in pairs] == [True, False, True]
+
+
+class DamagedDataset:
+    """Pairs in memory, one of which cannot be read."""
+
+    def __init__(self, pairs: list[BlindPair], damaged: int) -> None:
+        self._pairs, self._damaged = pairs, damaged
+        self.frame_indices = tuple(range(len(pairs)))
+
+    def pair(self, frame_index: int) -> BlindPair:
+        if frame_index == self._damaged:
+            raise ValueError("frames/000002/left.png: the PNG is truncated")
+        return self._pairs[frame_index]
+
+
+@pytest.mark.parametrize("stage", ["read", "measure", "estimate"])
+@pytest.mark.parametrize("tracker", [None, "flow"])
+def test_a_bad_pair_ends_the_sequence(
+    steady: list[BlindPair], tracker: str | None, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad, calls = 2, []
+    name = "measure" if stage == "measure" else "estimate_measured"
+    work = getattr(PairNavigator, name)
+
+    def fails_once(*args: Any) -> Any:
+        calls.append(args)
+        if len(calls) == bad + 1:
+            raise RuntimeError("half of the pair is done")
+        return work(*args)
+
+    if stage != "read":
+        monkeypatch.setattr(PairNavigator, name, fails_once)
+    settings = SequenceSettings(("joint",), tracker=tracker, filtered=True)
+    dataset = DamagedDataset(steady[:5], bad if stage == "read" else -1)
+    answers = list(process_dataset(dataset, SequenceNavigator(settings, ColorBlobDetector)))
+    assert [each.fault is not None for each in answers] == [False, False, True, False, False]
+    del answers[bad]
+    assert [each.begins for each in answers] == [True, False, True, False]
+    assert ["track" in each.stage_s for each in answers] == [False, tracker is not None] * 2
+    # One fix tells no motion.
+    assert [each.estimates[1].motion is not None for each in answers] == [False, True, False, True]
 
 
 class BrokenDetector(ColorBlobDetector):
