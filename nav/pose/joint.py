@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import bdtrc, chdtrc, chdtri
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
@@ -163,8 +163,18 @@ _HUBER = Loss(huber_sigmas=2.0)
 _LARGEST_CHI2 = 20.0
 # Residuals less likely than this are not noise.
 _LEAST_CHANCE = 1e-4
+# Where noise makes residuals as large once in so many frames, the stated noise is too small: 1 in a million.
+_LEAST_CHANCE_OF_NOISE = 1e-6
 # Two outliers can be identified when at least five more features remain.
 _LEAST_FOR_TWO_OUT = 7
+# Images of as many features as two outliers can be identified among.
+_LEAST_FOR_A_VARIANCE = 2 * _LEAST_FOR_TWO_OUT
+# Share of images whose residuals tell an error that all share. Such an error may be in one eye alone, which is half of
+# them, while three outliers of eight in both eyes are three eighths.
+_UNDER_A_COMMON_ERROR = 5 / 8
+# Larger deviations that all images share are no error of a rig or drogue, but of many markers: these pixels, or this
+# share of a marker's radius, 1.5 mm of 50.
+_LARGEST_COMMON_PX, _LARGEST_COMMON_FRACTION = 1.0, 0.03
 # Four markers overdetermine the plane that three determine.
 _LEAST_INLIERS = 4
 
@@ -172,7 +182,9 @@ _LEAST_INLIERS = 4
 def joint(observation: Observation) -> Solution | NoFixReason:
     """Method `joint`: weighted least squares over all markers in both eyes, from both weak-perspective attitudes.
 
-    See `nav.pose.joint` for the pose where the sign of the tilt is ambiguous.
+    See `nav.pose.joint` for the pose where the sign of the tilt is ambiguous. Where noise makes residuals as large once
+    in a million frames, rig or drogue are not as stated, and the covariance is multiplied by Birge's ratio, the
+    chi-square over its degrees of freedom.
     """
     return stereo_fault(observation) or solve_one(observed_features(observation, with_hub=False), observation.seen)
 
@@ -209,7 +221,20 @@ def solve_one(
     if reason is not None:
         return reason
     pose = RigidTransform(batch.rotations[0], batch.translations_m[0])
-    return Solution(pose, used, batch.covariances[0], _modes(batch), used_hub, note)
+    covariance = _birge_ratio(features, batch) * batch.covariances[0]
+    return Solution(pose, used, covariance, _modes(batch), used_hub, note)
+
+
+def _birge_ratio(features: Features, batch: JointBatch) -> float:
+    """Factor of one frame's covariance where the residuals are larger than the stated noise makes them; else 1.
+
+    Source: R. T. Birge, doi:10.1103/PhysRev.40.207; the square of the Particle Data Group's scale factor,
+    doi:10.1103/PhysRevD.110.030001, section 5.2.2. That widens every covariance, this one none that noise explains.
+    """
+    with_prior = 0 if batch.tilt_sign_reliable[0] else 2
+    freedom = 2 * int(features.seen.sum()) + with_prior - 6
+    chi2 = 2 * float(batch.mode_costs[0, 0])
+    return chi2 / freedom if freedom > 0 and chdtrc(freedom, chi2) < _LEAST_CHANCE_OF_NOISE else 1.0
 
 
 def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
@@ -240,7 +265,8 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     The first adjustment uses Huber's loss. If any feature then is an outlier, the adjustment is repeated for every
     subset without one or two features. The subset with the smallest sum of clipped chi-squares determines the outliers.
     The solution is that of `joint-hub` (or `joint`, where no hub was measured) without them. An edge of the hub counts
-    as a feature.
+    as a feature. Where most features have residuals that the stated noise does not explain, as with an error of the rig
+    or the drogue, outliers are those that stick out from theirs.
     """
     reason = stereo_fault(observation, allows_outliers=True) or hub_fault(observation)
     if reason is not None:
@@ -269,15 +295,18 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
     """(F,) which features agree with the pose of the majority; unmeasured ones count as inliers."""
     tilts = adjust_both_tilts(features, *two_fold_starts(features), _HUBER)
     best = int(np.argmin(tilts.costs))
-    all_chi2 = _feature_chi2(features.take(np.zeros(2, dtype=np.int64)), tilts)[best]
-    if (all_chi2 < _LARGEST_CHI2).all():
-        return np.ones(len(all_chi2), dtype=bool)
+    robust_eye_chi2 = _eye_chi2(features.take(np.zeros(2, dtype=np.int64)), tilts)[best]
+    robust_chi2 = robust_eye_chi2.sum(axis=0)
+    if (robust_chi2 < _LARGEST_CHI2).all():
+        return np.ones(len(robust_chi2), dtype=bool)
     copies = features.take(np.zeros(2 * len(_leave_out_sets(features)), dtype=np.int64))
     left_out = np.repeat(_leave_out_sets(features), 2, axis=0)
     subsets = copies.without(left_out)
     starts = two_fold_starts(subsets.take(slice(0, None, 2)))
     adjusted = adjust(subsets, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
-    chi2 = np.vstack([_feature_chi2(copies, adjusted), all_chi2])
+    eye_chi2 = np.concatenate([_eye_chi2(copies, adjusted), robust_eye_chi2[None]])
+    depth_m = float(tilts.translations_m[best, 2])
+    chi2 = eye_chi2.sum(axis=1) / _common_variance(features, eye_chi2, depth_m)
     scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
     inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
     if (inliers & features.is_marker & _measured_features(features)).sum() < _LEAST_INLIERS:
@@ -286,6 +315,36 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
         if _is_consistent(features, kept, chi2[best_subset]):
             return kept
     return inliers
+
+
+def _common_variance(features: Features, chi2: Array, depth_m: float) -> float:
+    """Variance by which the residuals of most images exceed what the stated noise explains; 1 where it explains them.
+
+    An error that all features share, of the rig or of the drogue, makes none of them an outlier.
+
+    Args:
+        features: one frame.
+        chi2: (S, E, F) of every image of a feature, in several adjustments.
+        depth_m: of the drogue. [m]
+
+    Source: the least quantile over the adjustments, and the factor for few measurements, P. J. Rousseeuw and
+    A. M. Leroy, Robust Regression and Outlier Detection (1987), doi:10.1002/0471725382.
+    """
+    images = chi2[:, features.seen[0]]
+    count = images.shape[1]
+    if count < _LEAST_FOR_A_VARIANCE:
+        return 1.0
+    rank = int(np.ceil(_UNDER_A_COMMON_ERROR * count))
+    largest = float(np.sort(images, axis=1)[:, rank - 1].min())
+    if bdtrc(count - rank, count, chdtrc(2, largest)) > _LEAST_CHANCE_OF_NOISE:
+        return 1.0
+    # An error of the drogue is the same in both eyes: as many measurements as images.
+    few = 1 + 5 / (count - 6)
+    variance = few**2 * largest / float(chdtri(2, 1 - _UNDER_A_COMMON_ERROR))
+    sigma_px = float(np.median(1 / features.measured[2, 0][features.seen[0]]))
+    radius_px = features.camera.fx_px * features.radii_m[0] / depth_m
+    largest_px = max(_LARGEST_COMMON_PX, _LARGEST_COMMON_FRACTION * radius_px)
+    return variance if np.sqrt(variance) * sigma_px <= largest_px else 1.0
 
 
 def _is_consistent(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
@@ -309,12 +368,12 @@ def _leave_out_sets(features: Features) -> NDArray[np.bool_]:
     return left_out
 
 
-def _feature_chi2(features: Features, adjusted: AdjustedPoses) -> Array:
-    """(S, F) chi-squares of every feature, summed over the eyes; infinite where they are nan."""
+def _eye_chi2(features: Features, adjusted: AdjustedPoses) -> Array:
+    """(S, E, F) chi-squares of every feature in each eye; infinite where they are nan."""
     state = AdjustmentState(adjusted.rotations, adjusted.translations_m, adjusted.departures)
-    size = 2 * features.measured.shape[2] * len(features.points_m)
-    residuals = linearise(features, state).residuals[:, :size]
-    squares = (residuals.reshape(len(residuals), -1, len(features.points_m)) ** 2).sum(axis=1)
+    eyes, count = features.measured.shape[2:]
+    residuals = linearise(features, state).residuals[:, : 2 * eyes * count]
+    squares = (residuals.reshape(-1, 2, eyes, count) ** 2).sum(axis=1)
     return np.where(np.isfinite(squares), squares, np.inf)
 
 

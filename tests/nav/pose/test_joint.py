@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import erfc
+from typing import Any
 
 import numpy as np
 import pytest
 
 from geometry.circles import project_disc_centers
-from nav.pose.joint import JointBatch, joint, joint_hub, solve_joint_batch
+from nav.pose.features import observed_features
+from nav.pose.joint import JointBatch, joint, joint_hub, joint_robust, solve_features, solve_joint_batch
 from nav.pose.pose_method import EXACT, Solution, StatedTolerances
 from tests.support.painted_pairs import Draws, draw_poses, make_pose
 
@@ -222,3 +225,29 @@ def test_joint_hub_reaches_the_bound_closely(z_m: float) -> None:
     # Measured as 0.99-1.04; 10,000 draws: 0.7 %, three of it.
     assert np.sqrt(((errors[:, :5] / bounds) ** 2).mean(axis=0)).max() < 1.04 + 0.021
     assert 0.97 < nees(errors, batch) < 1.03
+
+
+@pytest.mark.parametrize("rows_px", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize(("method", "features"), [(joint, 8), (joint_hub, 10), (joint_robust, 10)])
+def test_deviations_grow_with_an_error_that_all_markers_share(
+    method: Callable[..., Any], features: int, rows_px: float
+) -> None:
+    sigma_px, freedom = 0.004, 4 * features - 6
+    draws = draw_poses(np.random.default_rng(24), 10, 3.0, sigma_px)
+    for index, place in enumerate(draws.places):
+        pixels = draws.pixels_px[index] + np.array([[[0.0, 0.0]], [[0.0, rows_px]]])
+        solution = method(draws.observation(index, pixels_px=pixels))
+        off_m = solution.left_from_drogue.translation_m - place.translation_m
+        # Half of the rows' error moves the pose by r sqrt(2 F) of the nominal deviations, where r is that half over the
+        # noise, and half stays in the residuals: chi-square is 2 F r^2, and their quotient at most sqrt(freedom). One
+        # more for the noise. The nominal deviations are exceeded by up to 25 r.
+        assert (np.abs(off_m) < (np.sqrt(freedom) + 1) * np.sqrt(np.diag(solution.covariance)[:3])).all()
+
+
+@pytest.mark.parametrize("z_m", [2.0, 10.0, 40.0])
+def test_deviations_that_noise_explains_stay(z_m: float) -> None:
+    draws = draw_poses(np.random.default_rng(25), 20, z_m, 0.05)
+    for index in range(20):
+        features = observed_features(draws.observation(index), with_hub=False)
+        single = joint(draws.observation(index))
+        np.testing.assert_array_equal(single.covariance, solve_features(features).covariances[0])

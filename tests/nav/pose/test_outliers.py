@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from geometry.circles import project_disc_centers
+from geometry.stereo import EYES
 from nav.pose.joint import joint, joint_robust
 from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
 from nav.pose.triangulation_methods import (
@@ -18,7 +20,7 @@ from nav.pose.triangulation_methods import (
     paper_reading,
     three_sphere_candidates,
 )
-from tests.support.painted_pairs import Draws, draw_poses
+from tests.support.painted_pairs import Draws, draw_poses, drogue_features
 
 
 def corrupt(rng: np.random.Generator, draws: Draws, count: int, eyes: str = "one") -> np.ndarray:
@@ -107,6 +109,55 @@ def test_an_outlier_with_a_negative_disparity_ends_nothing(z_m: float) -> None:
         solution = joint_robust(draws.observation(index, pixels_px=pixels))
         assert isinstance(solution, Solution), solution.reason
         assert np.flatnonzero(~solution.used.all(axis=0)).tolist() == [index]
+
+
+# Of fitted markers near by.
+SHARP_PX = 0.003
+
+
+def with_outlier(pixels: np.ndarray, marker: int) -> np.ndarray:
+    wrong = pixels.copy()
+    wrong[1, marker] += (-3.0, 4.0)
+    return wrong
+
+
+@pytest.mark.parametrize("rows_px", [0.02, 0.1, 0.5])
+def test_rows_that_are_off_are_no_outliers_and_hide_none(rows_px: float) -> None:
+    draws = draw_poses(np.random.default_rng(46), 6, 3.0, SHARP_PX)
+    for index in range(6):
+        pixels = draws.pixels_px[index] + np.array([[[0.0, 0.0]], [[0.0, rows_px]]])
+        solution = joint_robust(draws.observation(index, pixels_px=pixels))
+        assert isinstance(solution, Solution), solution.reason
+        assert solution.used.all()
+        assert solution.used_hub is not None
+        cleaned = joint_robust(draws.observation(index, pixels_px=with_outlier(pixels, index)))
+        assert isinstance(cleaned, Solution), cleaned.reason
+        assert np.flatnonzero(~cleaned.used.all(axis=0)).tolist() == [index]
+
+
+@pytest.mark.parametrize("hub", [True, False])
+def test_markers_that_are_not_quite_in_place_have_a_pose(hub: bool) -> None:
+    rng = np.random.default_rng(47)
+    draws = draw_poses(rng, 6, 3.0, SHARP_PX)
+    points, radii = drogue_features(draws.layout)
+    for index, place in enumerate(draws.places):
+        built = points + np.column_stack([rng.normal(0, 3e-4, (len(points), 2)), np.zeros(len(points))])
+        pixels = np.array([project_disc_centers(draws.rig, place, built, radii, eye) for eye in EYES])
+        for wrong in (pixels, with_outlier(pixels, index)):
+            solution = joint_robust(draws.observation(index, hub, wrong))
+            assert isinstance(solution, Solution), solution.reason
+            assert solution.used.all(axis=0).sum() >= 5
+            # Five deviations of the distance by the size of a ring of five.
+            bound_m = 5 * 3.0 * 3e-4 / (0.28 * np.sqrt(5))
+            assert np.linalg.norm(solution.left_from_drogue.translation_m - place.translation_m) < bound_m
+        assert not solution.used[1, index]
+
+
+def test_many_wrong_markers_are_no_common_error() -> None:
+    draws = draw_poses(np.random.default_rng(48), 10, (1.7, 10.0), 0.1, markers=7)
+    pixels = corrupt(np.random.default_rng(49), draws, 4)
+    answers = [joint_robust(draws.observation(index, False, pixels[index])) for index in range(10)]
+    assert all(isinstance(answer, NoFixReason) for answer in answers)
 
 
 def test_a_wrong_hub_is_an_outlier() -> None:
