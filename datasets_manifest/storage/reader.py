@@ -82,13 +82,14 @@ class Dataset:
         """The truth of all pairs in the order of their indices.
 
         Args:
-            faults: count pairs whose record is damaged, which are left out; without, such a pair is an error.
+            faults: count pairs whose record is damaged or changed, which are left out; without, such a pair is an
+                error.
 
         Raises:
-            ValueError: a record cannot be read, and nothing counts faults; names the file.
+            ValueError: a record cannot be read or was changed, and nothing counts faults; names the file.
         """
         for frame_index in self.frame_indices:
-            record = read_or_note(frame_index, self.record, faults)
+            record = read_or_note(frame_index, self.unchanged_record, faults)
             if record is not None:
                 yield record
 
@@ -140,13 +141,28 @@ class Dataset:
             self._check_hash(frame_index, name, files[name], expected)
         return record, files
 
+    def unchanged_record(self, frame_index: int) -> PairRecord:
+        """The truth of one pair whose record is as it was written.
+
+        Raises:
+            ValueError: the pair is missing, or its record wrong or changed; names the file.
+        """
+        expected = self._record_hashes.get(frame_index)
+        if expected is None:
+            raise ValueError(f"{self.frames.where(frame_index)}: is not in the manifest")
+        data = self.frames.read(frame_index, RECORD_FILE)
+        # Parsed first, since "truncated" says more than "changed".
+        record = self._parse_record(frame_index, data)
+        self._check_hash(frame_index, RECORD_FILE, data, expected)
+        return record
+
     def checked_record(self, frame_index: int) -> PairRecord:
-        """The truth of one pair whose other files are as they were written.
+        """The truth of one pair whose record and other files are as they were written.
 
         Raises:
             ValueError: the pair is missing or its record wrong, or a file is missing or changed; names it.
         """
-        record = self.record(frame_index)
+        record = self.unchanged_record(frame_index)
         for name, expected in record.file_sha256.items():
             self._check_hash(frame_index, name, self.frames.read(frame_index, name), expected)
         return record

@@ -84,7 +84,7 @@ def score_estimates(
     methods = estimates_by_method(estimates, indices, source)
     truths, states = {}, []
     for index in indices:
-        record = read_or_note(index, data.record, faults)
+        record = read_or_note(index, data.unchanged_record, faults)
         if record is None:
             continue
         truths[index] = drogue_truth(record)

@@ -55,8 +55,8 @@ class ExportLog:
     def records(self, source: Dataset, with_files: bool = True) -> Iterator[PairRecord]:
         """The records of all pairs in the order of their indices, one at a time.
 
-        Where `faults` counts damaged pairs, all files of a pair are checked before it is given: a format's files are
-        written pair by pair, and half a pair would be worse than none.
+        Where `faults` counts damaged pairs, what the export reads of a pair is compared with its hashes before it is
+        given: a format's files are written pair by pair, and half a pair would be worse than none.
 
         Args:
             source: the dataset.
@@ -68,8 +68,10 @@ class ExportLog:
         """
 
         def read(frame_index: int) -> PairRecord:
-            is_checked = with_files and self.faults is not None
-            record = source.checked_record(frame_index) if is_checked else source.record(frame_index)
+            if self.faults is None:
+                record = source.record(frame_index)
+            else:
+                record = (source.checked_record if with_files else source.unchanged_record)(frame_index)
             fault = record_fault(record)
             if fault is not None:
                 raise ValueError(f"{source.frames.where(frame_index, RECORD_FILE)}: {fault}")

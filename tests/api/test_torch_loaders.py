@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 from collections import Counter
 from multiprocessing.context import BaseContext
 from pathlib import Path
@@ -15,10 +16,12 @@ from torch.utils.data import DataLoader
 
 import droguekit
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
+from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
 from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset
 from droguekit.batch.resume import open_dataset
 from droguekit.torch import PairDataset, RenderStream, sample_of_pair
+from tests.support.changed_records import with_another_pose
 from tests.support.recipe_builder import build_recipe
 from tests.support.small_datasets import SINGLE_PAIRS
 
@@ -55,6 +58,17 @@ def test_samples_are_the_pairs(pairs: StereoDataset) -> None:
         first = pair.record.views.left.markers[0]
         expected = (*(np.array(first.center_proj_px) + 0.5), first.visible_fraction)
         assert np.allclose(sample["keypoints_px"][0, 0].numpy(), expected)
+
+
+def test_changed_pairs_are_left_out(pairs: StereoDataset, tmp_path: Path) -> None:
+    copy = shutil.copytree(Path(pairs.path), tmp_path / "copy")
+    shown = next(pair.frame_index for pair in pairs if pair.truth is not None)
+    record = frame_folder(copy, shown) / RECORD_FILE
+    record.write_bytes(with_another_pose(record.read_bytes()))
+    dataset = PairDataset(copy, leave_out_damaged=True)
+    assert dataset.faults.count == 1 and dataset.faults.first is not None
+    assert dataset.faults.first == (shown, f"{record}: was changed: its hash differs from the recorded one")
+    assert shown not in dataset.dataset.frame_indices and len(dataset) == len(pairs) - 1
 
 
 def test_keypoints_lie_on_markers(pairs: StereoDataset) -> None:

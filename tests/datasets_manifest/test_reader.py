@@ -10,7 +10,9 @@ import pytest
 from datasets_manifest.storage.blind import BlindDataset, BlindPair
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset, read_shutter
+from tests.support.changed_records import with_another_pose
 
 
 @pytest.mark.parametrize("preset", ["rgb-ideal", "paper-colour", "mono"])
@@ -55,6 +57,18 @@ def test_verify_finds_what_changed(tiny: Path) -> None:
     record.write_bytes(record.read_bytes() + b" ")
     assert dataset.verify(0) == [f"{record}: was changed: its hash differs from the recorded one"]
     assert dataset.verify(2) == [f"{frame_folder(tiny, 2)}: is not in the manifest"]
+
+
+def test_a_changed_record_is_no_truth(tiny: Path) -> None:
+    dataset, file = Dataset(tiny), frame_folder(tiny, 1) / "record.json"
+    file.write_bytes(with_another_pose(file.read_bytes()))
+    for read in (dataset.unchanged_record, dataset.checked_record, lambda index: list(dataset.records())):
+        with pytest.raises(ValueError, match=r"000001/record\.json: was changed"):
+            read(1)
+    faults = PairFaults()
+    assert [record.frame_index for record in dataset.records(faults)] == [0, 3] and faults.count == 1
+    with pytest.raises(ValueError, match="000002: is not in the manifest"):
+        dataset.checked_record(2)
 
 
 def test_a_record_is_parsed_once_until_it_changes(tiny: Path) -> None:

@@ -25,6 +25,7 @@ from datasets_manifest.storage.reader import Dataset
 from droguekit.cli.main import WRONG_INPUT, run
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
+from tests.support.changed_records import with_another_pose
 from tests.support.drawn_pairs import Pair
 
 NAMES = (
@@ -191,14 +192,17 @@ def test_what_is_cut_off_is_told(name: str, mixed_dataset: Path, tmp_path: Path)
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("opencv", "kalibr", "ros-camera-info")])
 def test_a_damaged_pair_is_left_out_and_counted(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
-    first = min((copy / "frames").iterdir())
-    (first / "record.json").write_bytes((first / "record.json").read_bytes()[:-100])
-    faults = PairFaults()
-    write_export(name, copy, tmp_path / "out", ExportLog(faults=faults))
-    assert faults.first is not None
-    assert faults.count == 1 and faults.first[0] == int(first.name)
-    assert re.search(r"record\.json: is truncated", faults.first[1])
-    assert tree(tmp_path / "out")
+    record = min((copy / "frames").iterdir()) / "record.json"
+    whole = record.read_bytes()
+    for damaged, fault in ((whole[:-100], "is truncated"), (with_another_pose(whole), "was changed")):
+        record.write_bytes(damaged)
+        faults = PairFaults()
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        write_export(name, copy, tmp_path / "out", ExportLog(faults=faults))
+        assert faults.first is not None
+        assert faults.count == 1 and faults.first[0] == int(record.parent.name)
+        assert re.search(rf"record\.json: {fault}", faults.first[1])
+        assert tree(tmp_path / "out")
 
 
 def test_a_split_without_a_whole_pair_is_not_named(mixed_dataset: Path, tmp_path: Path) -> None:
