@@ -132,8 +132,10 @@ def as_location(text: str) -> Location:
     """The location that a user named: a URL as text, anything else as the path of a folder.
 
     Raises:
-        ValueError: a URL without a name.
+        ValueError: an empty text, or a URL without a name.
     """
+    if not text.strip():
+        raise ValueError(f"place: must be a folder or a URL, got {text!r}")
     scheme, slashes, name = text.partition("://")
     if not slashes:
         return Path(text)

@@ -249,3 +249,12 @@ def test_estimates_that_are_none(smoke_dataset: Path, tmp_path: Path) -> None:
     result = _run("benchmark", smoke_dataset, "--estimates", estimates, "--json", tmp_path / "out.json")
     _assert_refused(result, r"estimates\.jsonl, line 1: not a pose estimate: fix\.\S+: Field required")
     assert [path.name for path in tmp_path.iterdir()] == ["estimates.jsonl"]
+
+
+@pytest.mark.parametrize("words", [("render", "smoke", "--out", ""), ("merge", "", "a"), ("validate", " ")])
+def test_an_empty_place_is_not_the_current_folder(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _assert_refused(_run(*words), r"place: must be a folder or a URL, got ' ?'")
+    assert list(tmp_path.iterdir()) == []

@@ -182,6 +182,9 @@ def test_places_by_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for nothing in ("s3://", "s3:///", "memory://", "file://"):
         with pytest.raises(ValueError, match=f"{nothing}: is incomplete; give {nothing.rstrip('/')}//NAME"):
             as_location(nothing)
+    for empty in ("", "  "):
+        with pytest.raises(ValueError, match=f"place: must be a folder or a URL, got '{empty}'"):
+            as_location(empty)
     monkeypatch.chdir(tmp_path)
     assert absolute("data") == tmp_path / "data" and absolute("s3://b/n") == "s3://b/n"
 
