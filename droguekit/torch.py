@@ -40,6 +40,7 @@ from drogue_models.marker_layout import marker_layout
 from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset, StereoPair, stored_pair
 from droguekit.batch.frame_task import FrameTask
+from droguekit.batch.progress import progress_report
 from droguekit.batch.resume import open_dataset
 from render.device import Device
 from render.engine import engine_notice
@@ -214,7 +215,7 @@ class RenderStream(IterableDataset[Any]):
         self._replays, self._transform = replays, transform
         self._rank, self._ranks = rank, ranks
         self._epoch, self._batches_done, self._batch_size = 0, 0, 1
-        with open_dataset(self.cache, RecipeSource(recipe, RECIPE_TEXT)):
+        with open_dataset(self.cache, RecipeSource(recipe, RECIPE_TEXT), say=progress_report().say):
             if FrameStore(self.cache).pairs_per_tar is not None:
                 raise ValueError(f"{cache}: keeps its pairs in tar files; give another folder for the cache")
 

@@ -275,7 +275,8 @@ def read_manifest(dataset: Location) -> Manifest:
                 f"{dataset}: is a blind dataset, which has no truth; it came from another one, or was imported"
             ) from error
         raise ValueError(
-            f"{path}: is missing; `render` into this folder completes a dataset, `import` makes one of other images"
+            f"{path}: is missing; `render` with the same recipe makes its pairs again, `import` makes a dataset "
+            "of other images"
         ) from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

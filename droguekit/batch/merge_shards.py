@@ -51,7 +51,7 @@ def merge_shards(
     _check_complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
     datasets = {shard: Dataset(shard) for shard in shards}
     source = RecipeSource(manifest.recipe, open_storage(first).read(RECIPE_FILE).decode())
-    with open_dataset(out, source, pairs_per_tar) as stream:
+    with open_dataset(out, source, pairs_per_tar, report.say) as stream:
         events = EventLog(stream)
         before = read_manifest(out)
         if before.frames:

@@ -296,7 +296,7 @@ def render_dataset(
     notice = engine_notice(recipe.render.engine, options.device)
     if notice is not None:
         report.say(notice)
-    with open_dataset(out, source, options.pairs_per_tar) as stream:
+    with open_dataset(out, source, options.pairs_per_tar, report.say) as stream:
         events = EventLog(stream)
         manifest = read_manifest(out)
         present = len(list_frames(out))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
+
 from datasets_manifest.atomic import try_lock
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.frame_store import FrameStore, shard_numbers
+from datasets_manifest.storage.frame_store import FrameStore, list_frames, shard_numbers
 from datasets_manifest.storage.manifest import (
     Manifest,
     build_manifest,
@@ -31,12 +33,13 @@ from datasets_manifest.storage.packing import (
     remove_packed,
     repair_shards,
 )
-from datasets_manifest.storage.storage import Location, map_in_order, open_storage
+from datasets_manifest.storage.storage import Location, Storage, map_in_order, open_storage
 from datasets_manifest.storage.writer import remove_frame, remove_leftovers
 from datasets_manifest.types.records import PairRecord
 from drogue_models.untrusted_files import parse_json
+from geometry.se3 import RigidTransform
 from render.version import RENDER_VERSION
-from scenes.sampler import split_of_scenes
+from scenes.sampler import sample_frame, split_of_scenes
 
 _OWN_NAMES = {
     layout.RECIPE_FILE,
@@ -49,14 +52,19 @@ _OWN_NAMES = {
     layout.ANNOTATIONS_FOLDER,
     layout.CALIBRATION_FOLDER,
 }
+_FRAME_FOLDERS = {layout.FRAMES_FOLDER, layout.SHARDS_FOLDER}
+# Machines differ in the last digits of what they draw; two draws differ by far more.
+_SAME_POSE = 1e-6
 
 
 @contextmanager
-def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
+def open_dataset(
+    out: Location, source: RecipeSource, pairs_per_tar: int | None = None, say: Callable[[str], None] | None = None
+) -> Iterator[TextIO]:
     """Open a new dataset, or one to be completed, and keep other runs out of it.
 
-    Frames of a folder without a manifest are removed, and so are half-written files of killed runs. A new folder is
-    removed again when the block ends with an error before it has a frame.
+    Pairs of the same recipe that no manifest vouches for are removed, and so are half-written files of killed runs. A
+    new folder is removed again when the block ends with an error before it has a frame.
 
     An object store has no lock: two runs in one place would damage each other's frames. Give each its own place and
     merge.
@@ -65,6 +73,7 @@ def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None 
         out: its place.
         source: its recipe.
         pairs_per_tar: frames in a tar file; None keeps what the dataset has.
+        say: is told of pairs that are removed.
 
     Yields:
         The stream to which events are appended.
@@ -75,9 +84,10 @@ def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None 
     """
     check_pairs_per_tar(pairs_per_tar)
     folder = open_storage(out).path("")
+    _refuse_foreign(folder or out, source)
     with _open_place(out) if folder is None else _open_folder(folder) as events:
         remove_leftovers(out)
-        _check_or_create(out, source)
+        _check_or_create(out, source, say)
         configure_packing(out, pairs_per_tar)
         repair_shards(out)
         yield events
@@ -99,7 +109,6 @@ def _open_folder(out: Path) -> Iterator[TextIO]:
     is_new = not out.exists()
     if not is_new and not out.is_dir():
         raise ValueError(f"{out}: is a file; give a folder for the dataset")
-    _refuse_foreign(out)
     out.mkdir(parents=True, exist_ok=True)
     try:
         with (out / layout.EVENTS_FILE).open("a", encoding="utf-8") as events:
@@ -114,7 +123,6 @@ def _open_folder(out: Path) -> Iterator[TextIO]:
 @contextmanager
 def _open_place(out: Location) -> Iterator[TextIO]:
     """The same on an object store, where files cannot be appended to: events go to a temporary file until the end."""
-    _refuse_foreign(out)
     storage = open_storage(out)
     before = storage.read(layout.EVENTS_FILE) if storage.exists(layout.EVENTS_FILE) else b""
     storage.write(layout.EVENTS_FILE, before)  # lets remote workers check that they see the same place
@@ -128,11 +136,60 @@ def _open_place(out: Location) -> Iterator[TextIO]:
                 shutil.copyfileobj(events, stream)
 
 
-def _refuse_foreign(out: Location) -> None:
-    names = open_storage(out).names("")
-    foreign = [name for name in names if name not in _OWN_NAMES and not name.startswith(".")]
-    if foreign and layout.MANIFEST_FILE not in names:
+def _refuse_foreign(out: Location, source: RecipeSource) -> None:
+    """Refuse a place without a manifest unless it holds what a killed start leaves, or pairs of the same recipe.
+
+    Raises:
+        ValueError: it holds something else.
+    """
+    storage = open_storage(out)
+    names = [name for name in storage.names("") if not name.startswith(".")]
+    if layout.MANIFEST_FILE in names:
+        return
+    has_pairs = bool(FrameStore(out).staged or shard_numbers(storage))
+    if has_pairs and not _is_of_recipe(out, source):
+        raise ValueError(
+            f"{out}: holds pairs without {layout.MANIFEST_FILE}, not of this recipe, seed and version; give another "
+            "folder"
+        )
+    # Everything else is written after the manifest, so that where no pairs are it is somebody else's.
+    left = _OWN_NAMES if has_pairs else {layout.EVENTS_FILE, layout.RECIPE_FILE}
+    hold = {name for name in _FRAME_FOLDERS if any(not inside.startswith(".") for inside in storage.names(name))}
+    foreign = [name for name in names if name not in left and (name not in _FRAME_FOLDERS or name in hold)]
+    if layout.RECIPE_FILE in names and not _is_same_text(storage, source):
+        foreign.append(layout.RECIPE_FILE)
+    if foreign:
         raise ValueError(f"{out}: holds other files ({foreign[0]}); give a new or empty folder for the dataset")
+
+
+def _is_same_text(storage: Storage, source: RecipeSource) -> bool:
+    return storage.exists(layout.RECIPE_FILE) and storage.read(layout.RECIPE_FILE) == source.text.encode()
+
+
+def _is_of_recipe(out: Location, source: RecipeSource) -> bool:
+    """Whether pairs without a manifest are of a recipe: by its text, and by what the first of them shows.
+
+    The text alone does not tell of another seed, and is the same for all recipes from Python.
+    """
+    if not _is_same_text(open_storage(out), source):
+        return False
+    store = FrameStore(out)
+    first = next(iter(store.indices()), None)
+    if first is None:
+        return True
+    try:
+        found = PairRecord.model_validate(parse_json(store.read(first, layout.RECORD_FILE))).frame
+        drawn = sample_frame(source.recipe, first)
+    except ValueError:
+        return False
+    is_same = (found.seed, found.scene_id, found.drogue) == (drawn.seed, drawn.scene_id, drawn.drogue)
+    return is_same and _is_same_pose(found.left_from_drogue, drawn.left_from_drogue)
+
+
+def _is_same_pose(first: RigidTransform | None, second: RigidTransform | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return bool(np.allclose(first.as_matrix(), second.as_matrix(), rtol=0, atol=_SAME_POSE))
 
 
 def _lock(events: TextIO, out: Path) -> None:
@@ -140,7 +197,7 @@ def _lock(events: TextIO, out: Path) -> None:
         raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder")
 
 
-def _check_or_create(out: Location, source: RecipeSource) -> None:
+def _check_or_create(out: Location, source: RecipeSource, say: Callable[[str], None] | None) -> None:
     """Check that the place belongs to the recipe; a new one gets its manifest before its first frame."""
     storage, recipe = open_storage(out), source.recipe
     if storage.exists(layout.MANIFEST_FILE):
@@ -155,6 +212,9 @@ def _check_or_create(out: Location, source: RecipeSource) -> None:
                 "pixels differ; render into a new folder"
             )
         return
+    pairs = len(list_frames(out))
+    if pairs and say is not None:
+        say(f"{out}: its {layout.MANIFEST_FILE} is missing, so that its {pairs} pairs are discarded")
     for name in storage.folders_with(layout.FRAMES_FOLDER, layout.RECORD_FILE):
         storage.delete_folder(f"{layout.FRAMES_FOLDER}/{name}", layout.RECORD_FILE)
     for number in shard_numbers(storage):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from datasets_manifest.atomic import PART_SUFFIX
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
@@ -158,8 +160,32 @@ def test_frames_that_no_manifest_vouches_for_are_made_again(analytic_dataset: Pa
     out = tmp_path / "copy"
     shutil.copytree(analytic_dataset, out)
     (out / layout.MANIFEST_FILE).unlink()
-    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).kept == 0
+    told = io.StringIO()
+    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE, told=told).kept == 0
+    assert f"{out}: its manifest.json is missing, so that its 8 pairs are discarded" in told.getvalue()
     assert file_hashes(out) == file_hashes(analytic_dataset)
+
+
+@pytest.mark.parametrize("other", ["text", "seed", "no recipe"])
+def test_frames_of_another_recipe_stay_where_the_manifest_is_missing(
+    other: str, analytic_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(analytic_dataset, out)
+    (out / layout.MANIFEST_FILE).unlink()
+    text, seed = ANALYTIC_RECIPE, None
+    if other == "text":
+        text = text.replace('name = "quick"', 'name = "slow"')
+    elif other == "seed":
+        seed = 6
+    else:
+        (out / layout.RECIPE_FILE).unlink()
+    before = file_hashes(out)
+    recipe = parse_recipe(text, seed=seed)
+    message = r"holds pairs without manifest\.json, not of this recipe, seed and version; give another folder"
+    with pytest.raises(ValueError, match=message):
+        render_dataset(RecipeSource(recipe, text), out, range(1), 0, PlainProgress(io.StringIO()))
+    assert file_hashes(out) == before
 
 
 def test_a_part_is_a_dataset_that_the_rest_completes(analytic_dataset: Path, tmp_path: Path) -> None:
@@ -280,11 +306,38 @@ def test_frames_that_the_recipe_does_not_have_are_refused(tmp_path: Path, frames
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_with_other_things_is_refused_and_untouched(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(ValueError, match=r"holds other files \(thesis\.tex\); give a new or empty folder"):
-        render_recipe(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+@pytest.mark.parametrize(
+    "name",
+    [
+        "thesis.tex",
+        "recipe.toml",
+        "README.md",
+        "croissant.json",
+        "annotations/all.json",
+        "calibration/kalibr_camchain.yaml",
+        "frames/000000/left.png",
+        "shards/notes.txt",
+    ],
+)
+def test_a_folder_with_other_things_is_refused_and_untouched(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("mine")
+    message = re.escape(f"holds other files ({name.partition('/')[0]}); give a new or empty folder")
+    with pytest.raises(ValueError, match=message):
+        render_recipe(out)
+    assert [path for path in out.rglob("*") if path.is_file()] == [out / name]
+    assert (out / name).read_text() == "mine"
+
+
+def test_what_a_killed_start_leaves_is_no_other_thing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / layout.FRAMES_FOLDER).mkdir(parents=True)
+    (out / layout.RECIPE_FILE).write_text(ANALYTIC_RECIPE)
+    (out / layout.EVENTS_FILE).touch()
+    (out / f".{layout.MANIFEST_FILE}-0{PART_SUFFIX}").write_text("{")
+    assert render_recipe(out, range(1), workers=0, text=ANALYTIC_RECIPE).pairs == 1
+    assert leftovers(out) == []
 
 
 def test_a_file_is_no_place_for_a_dataset(tmp_path: Path) -> None:
