@@ -42,7 +42,7 @@ def checked_lines(
     if json_out is not None:
         from datasets_manifest.atomic import write_text_atomic
 
-        write_text_atomic(json_out, json.dumps(check.to_json(), indent=1) + "\n")
+        write_text_atomic(json_out, json.dumps(check.to_json(), indent=1, allow_nan=False) + "\n")
         yield f"wrote {json_out}"
     if html_out is not None:
         from droguekit.visualization.check_page import write_check_page

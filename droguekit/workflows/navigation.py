@@ -59,7 +59,7 @@ class LatencyReport:
     def to_json(self) -> str:
         """The content of the latency file."""
         content = {key: value for key, value in asdict(self).items() if key != "left_out" or value is not None}
-        return json.dumps({"schema": _SCHEMA, **content}, indent=1) + "\n"
+        return json.dumps({"schema": _SCHEMA, **content}, indent=1, allow_nan=False) + "\n"
 
     def lines(self) -> list[str]:
         """The report as a table."""

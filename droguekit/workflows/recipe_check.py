@@ -43,7 +43,7 @@ class MarkerPrediction:
         light: `day`, `dusk` or `night`.
         distance_m: of the drogue.
         radius_px: of the marker's image.
-        gap_px: between neighbouring markers' images.
+        gap_px: between neighbouring markers' images; None of a single marker.
         rim_px: diameter of the rim's image.
         contrast: light of the marker above that beside it, over that beside it.
         snr: light of the marker over the noise of a fit.
@@ -56,7 +56,7 @@ class MarkerPrediction:
     light: str
     distance_m: float
     radius_px: float
-    gap_px: float
+    gap_px: float | None
     rim_px: float
     contrast: float
     snr: float
@@ -257,10 +257,10 @@ def _predict(recipe: Recipe, scene: _Scene, light: str, distance_m: float) -> Ma
         noise = FeatureNoise(sigma_px, sigma_px)
         bound = pose_bound(rig, pose, layout, features_seen(layout, hub=False), noise)
     x_m, _, z_m, pitch_deg, _ = (None,) * 5 if bound is None else (float(each) for each in bound)
-    gap_px = smallest_gap_m(layout) * scale if layout.count > 1 else np.inf
+    gap_px = smallest_gap_m(layout) * scale if layout.count > 1 else None
     rim_px = 2 * recipe.drogue.rim_radius_m * scale
     return MarkerPrediction(
-        light, distance_m, radius_px, float(gap_px), rim_px, contrast, snr, clipped, sigma_px, x_m, z_m, pitch_deg
+        light, distance_m, radius_px, gap_px, rim_px, contrast, snr, clipped, sigma_px, x_m, z_m, pitch_deg
     )
 
 
@@ -337,7 +337,7 @@ def _advice(recipe: Recipe, check: RecipeCheck, scenes: dict[str, _Scene]) -> It
             f"markers are below {_SMALLEST_RADIUS_PX} px radius from {small[0]:.3g} m on: use a radius of "
             f"{needed_m:.2g} m, a longer lens, or by day the method joint-rim, which measures the rim"
         )
-    close = [row.distance_m for row in near if row.gap_px < _LEAST_GAP_PX]
+    close = [row.distance_m for row in near if row.gap_px is not None and row.gap_px < _LEAST_GAP_PX]
     if close:
         yield f"neighbouring markers merge from {close[0]:.3g} m on, {_LEAST_GAP_PX:g} px apart: use fewer of them"
     tiny = [row.distance_m for row in near if row.rim_px < _LEAST_BOX_PX]

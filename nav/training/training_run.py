@@ -262,7 +262,9 @@ def _evaluate_and_export(out: Path, state: TrainingState, evaluator: _Evaluator)
     corpus, settings = evaluator.corpus, evaluator.settings
     best_step, best = _best_network(out, settings, state)
     result, model = evaluator.evaluate(best.to(evaluator.compute.device), best_step, out / ONNX_FILE, has_test=True)
-    write_text_atomic(out / RESULT_FILE, json.dumps(_result_table(result, corpus, settings), indent=1) + "\n")
+    write_text_atomic(
+        out / RESULT_FILE, json.dumps(_result_table(result, corpus, settings), indent=1, allow_nan=False) + "\n"
+    )
     write_onnx(model, out / ONNX_FILE, _metadata(result, corpus, settings, best))
     last, of_last = best, result
     if state.step != best_step:

@@ -148,6 +148,21 @@ def test_the_command_writes_numbers_and_one_page(tmp_path: Path, capsys: pytest.
     assert "http:" not in text and "https:" not in text
 
 
+def test_a_single_marker_has_no_gap(tmp_path: Path) -> None:
+    recipe, numbers = written(tmp_path), tmp_path / "check.json"
+    ring = "marker_count = 12\nmarker_ring_radius_m = 0.28\n"
+    drogue = (tmp_path / "basket.toml").read_text()
+    assert ring in drogue
+    (tmp_path / "basket.toml").write_text(drogue.replace(ring, "marker_positions_m = [[0.28, 0.0]]\n"))
+    assert run(["check", str(recipe), "--json", str(numbers)]) == DONE
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    content = json.loads(numbers.read_text(), parse_constant=refuse)
+    assert {row["gap_px"] for row in content["markers"]} == {None}
+
+
 def test_a_drogue_without_markers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(RECIPE.format(bits=8, high=40.0).replace("basket.toml", "basket-grey"))
