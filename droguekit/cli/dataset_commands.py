@@ -63,7 +63,16 @@ EXAMPLES = {
 }
 
 
+# The options of `new` that only one kind has.
+_OF_KIND = {
+    "drogue": ("rim_radius", "markers", "marker_radius", "luminance"),
+    "rig": ("preset", "size", "focal_px", "baseline", "bits"),
+    "recipe": ("drogue", "rig", "distance", "pairs"),
+}
+
+
 def new(
+    context: typer.Context,
     kind: Annotated[Literal["drogue", "rig", "recipe"], typer.Argument(help="What to write.")],
     out: Annotated[Path, output_option("--out", "FILE.toml", "File to write; must not exist yet.")],
     rim_radius: Annotated[float, typer.Option("--rim-radius", metavar="M", help="Drogue: outermost radius.")] = 0.305,
@@ -92,6 +101,11 @@ def new(
     """
     from droguekit.workflows.new_files import FileChoices, write_new_file
 
+    for other, names in _OF_KIND.items():
+        for name in names:
+            source = context.get_parameter_source(name)
+            if other != kind and source is not None and source.name != "DEFAULT":
+                raise ValueError(f"--{name.replace('_', '-')}: is of a {other}, and this is a {kind}; leave it out")
     choices = FileChoices(
         rim_radius_m=rim_radius,
         markers=markers,

@@ -69,6 +69,22 @@ def test_numbers_that_do_not_fit_are_told_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+OPTIONS = {
+    "drogue": {"--rim-radius": "0.305", "--markers": "8", "--marker-radius": "0.01", "--luminance": "0"},
+    "rig": {"--preset": "nonsense", "--size": "1x1", "--focal-px": "2000", "--baseline": "0.12", "--bits": "8"},
+    "recipe": {"--drogue": "nonsense", "--rig": "mono", "--distance": "5:40", "--pairs": "100"},
+}
+
+
+@pytest.mark.parametrize("kind", OPTIONS)
+def test_an_option_of_another_kind_is_refused(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for other in OPTIONS.keys() - {kind}:
+        for option, value in OPTIONS[other].items():
+            assert run(["new", kind, option, value, "--out", str(tmp_path / "mine.toml")]) == WRONG_INPUT
+            assert f"error: {option}: is of a {other}, and this is a {kind}" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_numbers_and_names_come_back_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(["new", "rig", "--focal-px", "1745.678912", "--size", "0640x0480", "--out", "my rig.toml"]) == DONE
