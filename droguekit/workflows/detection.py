@@ -6,7 +6,7 @@ Packages are imported where they are used, so that `--help` stays fast.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -70,6 +70,22 @@ def _render_source(source: RecipeSource, out: Path, workers: int | None, report:
     return place
 
 
+def _check_names(sources: Sequence[str], found: Sequence[Location | RecipeSource]) -> None:
+    """Check that no two recipes would be rendered into one folder.
+
+    Raises:
+        ValueError: two have one name.
+    """
+    of_name: dict[str, str] = {}
+    for source, each in zip(sources, found, strict=True):
+        if isinstance(each, Path | str):
+            continue
+        name = each.recipe.name
+        if name in of_name:
+            raise ValueError(f"{source}: has the name of {of_name[name]}, {name!r}; give each recipe a name of its own")
+        of_name[name] = source
+
+
 def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) -> TrainingResult:
     """Render what is missing, train, evaluate and export.
 
@@ -102,6 +118,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     # Rendering takes hours, so errors that would stop the training are found first.
     if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
+    _check_names(options.sources, found)
     check_training(out, settings, start)
     if options.photographs is not None:
         for path in find_photographs(options.photographs):

@@ -61,6 +61,17 @@ def test_nothing_is_rendered_for_a_training_that_cannot_be(
     assert message in capsys.readouterr().err and not out.exists()
 
 
+def test_two_recipes_of_one_name_are_refused_before_any_is_rendered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, out = tmp_path / "first.toml", tmp_path / "second.toml", tmp_path / "out"
+    first.write_text(RECIPE)
+    second.write_text(recipe_text(BASE, seed=9))
+    assert run(["train", str(first), str(second), "--out", str(out)]) == WRONG_INPUT
+    assert f"error: {second}: has the name of {first}, 'two-scenes'" in capsys.readouterr().err
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
