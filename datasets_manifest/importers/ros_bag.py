@@ -241,8 +241,15 @@ class _Recording(DirectoryReader):
     STORAGE_PLUGINS: Mapping[str, Any] = {"mcap": McapReader, "sqlite3": _Database}
 
 
+class _OfAnyCase(dict[str, Any]):
+    """By the suffix of a file, which other systems write in capitals."""
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return super().get(key.lower(), default)
+
+
 class _Ros2Reader(Ros2Reader):
-    STORAGE_PLUGINS: Mapping[str, Any] = {"dir": _Recording, ".mcap": McapReader, ".db3": _Database}
+    STORAGE_PLUGINS: Mapping[str, Any] = _OfAnyCase({"dir": _Recording, ".mcap": McapReader, ".db3": _Database})
 
 
 class _BagReader:
@@ -257,7 +264,7 @@ class _BagReader:
 
     def __init__(self, path: Path) -> None:
         """Open a bag; whatever a damaged one makes its reader raise is raised."""
-        is_ros1 = path.suffix == ".bag"
+        is_ros1 = path.suffix.lower() == ".bag"
         self._reader: Ros1Reader | _Ros2Reader = Ros1Reader(path) if is_ros1 else _Ros2Reader(path)
         self._reader.open()
         try:

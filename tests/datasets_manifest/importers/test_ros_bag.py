@@ -53,6 +53,19 @@ def test_a_ros_1_bag_has_matrices_with_capital_names(tmp_path: Path) -> None:
     assert bag.rig().baseline_m == pytest.approx(BASELINE_M)
 
 
+@pytest.mark.parametrize("name", ["X.BAG", "X.MCAP", "X.Db3"])
+def test_a_suffix_may_be_in_capitals(name: str, tmp_path: Path) -> None:
+    capital = tmp_path / name
+    if name == "X.BAG":
+        write_bag1(tmp_path / "x.bag", (1,)).rename(capital)
+    else:
+        plugin = StoragePlugin.MCAP if name == "X.MCAP" else StoragePlugin.SQLITE3
+        bag = write_bag2(tmp_path / "x", stereo((1,)), plugin)
+        (file,) = (path for path in bag.iterdir() if path.suffix == name[1:].lower())
+        file.rename(capital)
+    assert RosBag(capital).count == 1
+
+
 def test_compressed_images_have_their_calibration_beside_the_raw_topic(tmp_path: Path) -> None:
     messages = [message for message in stereo((1,)) if message[1] == INFO]
     for eye in ("left", "right"):
