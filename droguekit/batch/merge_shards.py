@@ -50,7 +50,7 @@ def merge_shards(
     drops = [drop for other in manifests.values() for drop in other.drops if drop.frame_index not in sources]
     _check_complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
     datasets = {shard: Dataset(shard) for shard in shards}
-    source = RecipeSource(manifest.recipe, open_storage(first).read(RECIPE_FILE).decode())
+    source = RecipeSource(manifest.recipe, _recipe_text(first))
     with open_dataset(out, source, pairs_per_tar, report.say) as stream:
         events = EventLog(stream)
         before = read_manifest(out)
@@ -156,6 +156,16 @@ def _check_complete(count: int, there: set[int]) -> None:
             f"shards: {len(missing)} of {count} frames are in none of them: {shown}; run the commands of their "
             "shards again, then merge"
         )
+
+
+def _recipe_text(shard: Location) -> str:
+    storage = open_storage(shard)
+    try:
+        return storage.read(RECIPE_FILE).decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{storage.where(RECIPE_FILE)}: is no UTF-8 text: {error.reason} at byte {error.start}; put the recipe back"
+        ) from error
 
 
 def _copy_frame(source: Dataset, frame_index: int, out: Location) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -237,4 +238,6 @@ def _write(data: bytes, out: Path) -> None:
     except OSError as error:
         raise ValueError(f"--out: {out} cannot be written: {error.strerror}") from error
     finally:
-        part.unlink(missing_ok=True)
+        # On a read-only file system this fails too, which must not hide the reason.
+        with suppress(OSError):
+            part.unlink(missing_ok=True)

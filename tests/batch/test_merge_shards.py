@@ -106,6 +106,15 @@ def test_a_damaged_frame_is_not_joined(
     assert "000001/right.png: was changed" in capsys.readouterr().err
 
 
+def test_a_recipe_that_is_no_text_is_named(
+    shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (shards[0] / layout.RECIPE_FILE).write_bytes(b"# \xff")
+    assert merge(tmp_path / "out", *shards) == WRONG_INPUT
+    assert f"error: {shards[0]}/recipe.toml: is no UTF-8 text: invalid start byte at byte 2" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_shard_of_another_recipe_is_refused(
     made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

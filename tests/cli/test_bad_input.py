@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -258,3 +259,13 @@ def test_an_empty_place_is_not_the_current_folder(
     monkeypatch.chdir(tmp_path)
     _assert_refused(_run(*words), r"place: must be a folder or a URL, got ' ?'")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_read_only_file_system_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), "part")
+
+    out = tmp_path / "drogue.stl"
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    _assert_refused(_run("model", "--out", out), f"--out: {out} cannot be written: Read-only file system")
