@@ -111,6 +111,18 @@ def parse_drogue(text: str, folder: Path) -> DrogueParameters:
     return DrogueParameters.model_validate(table)
 
 
+def drogue_text(drogue: DrogueParameters) -> str:
+    """TOML text that `parse_drogue` reads back as the same drogue; a body's mesh must lie in the file's folder."""
+    import tomlkit
+
+    table = drogue.model_dump(mode="json", exclude_none=True)
+    if drogue.hub is None:
+        table["hub"] = False
+    if drogue.body_mesh is not None:
+        table["body_mesh"] = drogue.body_mesh.path
+    return tomlkit.dumps(table)
+
+
 class MarkerRing(FrozenModel):
     """An even ring of markers in the short form of a TOML file.
 

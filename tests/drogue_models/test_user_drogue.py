@@ -11,7 +11,7 @@ import trimesh
 from drogue_models.meshes import drogue_meshes, example_body
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.parts import Part
-from drogue_models.presets import load_drogue
+from drogue_models.presets import drogue_text, load_drogue, preset_names
 
 RING = 'name = "mine"\nmarker_count = 6\nmarker_ring_radius_m = 0.27\n'
 
@@ -51,6 +51,12 @@ def test_shipped_body_is_what_its_call_makes() -> None:
 def test_short_form_of_a_ring(tmp_path: Path) -> None:
     drogue = load_drogue(write_toml(tmp_path, RING))
     assert drogue == DrogueParameters(name="mine", marker_positions_m=even_ring(6, 0.27))
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_drogue_written_as_text_is_read_back(name: str, tmp_path: Path) -> None:
+    drogue = load_drogue(name).model_copy(update={"name": "mine"})
+    assert load_drogue(write_toml(tmp_path, drogue_text(drogue))) == drogue
 
 
 def test_long_form_of_the_positions(tmp_path: Path) -> None:

@@ -27,10 +27,13 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import PIXEL_VALUES_TOPIC, PixelValues, StereoImages
 from datasets_manifest.types.records import PairRecord
-from drogue_models.presets import PRESETS
+from drogue_models.parameters import DrogueParameters
+from drogue_models.presets import drogue_text, load_drogue, preset_names
 from geometry.se3 import FLU_FROM_FRD, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
+
+DROGUE_FILE = "drogue.toml"
 
 MAP_FRAME, BASE_FRAME = "map", "base_link"
 
@@ -60,18 +63,19 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
     Args:
         dataset: folder.
-        out: folder to make; it holds a folder for each bag.
+        out: folder to make; it holds a folder for each bag, and a file of the drogue where that is no shipped one.
         log: receives the progress, and counts pairs without a pose and drogues beside the sought one.
 
     Returns:
-        The bags' folders.
+        The bags' folders, and the drogue's file.
 
     Raises:
         ValueError: a pair that cannot be read, or times that do not ascend.
         OSError: it cannot be written; nothing incomplete is left.
     """
     source = Dataset(dataset)
-    log.remarks.append(_drogue_remark(source.manifest.recipe))
+    recipe = source.manifest.recipe
+    log.remarks.append(_drogue_remark(recipe, out / DROGUE_FILE))
     order = SequenceOrder()
     names = []
     with new_folder(out) as folder, ExitStack() as bag_is_open:
@@ -86,17 +90,25 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
             if record.left_from_drogue is None:
                 log.lost("pairs without a drogue have no pose")
+        if not recipe.variants and not _is_shipped(recipe.drogue):
+            names.append(DROGUE_FILE)
+            (folder / DROGUE_FILE).write_text(drogue_text(recipe.drogue), encoding="utf-8")
     return [out / name for name in names]
 
 
-def _drogue_remark(recipe: Recipe) -> str:
+def _is_shipped(drogue: DrogueParameters) -> bool:
+    return drogue.name in preset_names() and load_drogue(drogue.name) == drogue
+
+
+def _drogue_remark(recipe: Recipe, file: Path) -> str:
     """How to tell the command `import`, which takes a bag for one of the preset red-8, which drogue it shows."""
     if recipe.variants:
         return "shows several drogues, and import knows one for all pairs"
-    name = recipe.drogue.name
-    if PRESETS.get(name) != recipe.drogue:
-        return "import it with --drogue and a .toml file of the drogue, which is in the dataset's recipe.toml"
-    return f"import it with --drogue {name}"
+    drogue = recipe.drogue
+    if _is_shipped(drogue):
+        return f"import it with --drogue {drogue.name}"
+    mesh = "" if drogue.body_mesh is None else f"; its mesh {drogue.body_mesh.path} must lie in that file's folder"
+    return f"import it with --drogue {file}{mesh}"
 
 
 class _Bag:

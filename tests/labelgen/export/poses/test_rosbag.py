@@ -15,14 +15,17 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import leftovers
+from drogue_models.presets import load_drogue
 from droguekit.cli.main import DONE, run
 from geometry.se3 import RigidTransform
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.poses.rosbag import POSE_TOPIC, camera_info_topic, image_topic
+from tests.support.drawn_pairs import Pair, write_drawn_dataset
 from tests.support.recipe_builder import Section
 
 Messages = dict[str, list[tuple[int, Any]]]
@@ -180,6 +183,18 @@ def test_the_drogue_that_import_must_be_told_is_named(
     log = ExportLog()
     write_export("rosbag", mixed_dataset, tmp_path / "several", log)
     assert log.remarks == ["shows several drogues, and import knows one for all pairs"]
+
+
+def test_a_drogue_that_ships_with_nobody_is_written_beside_the_bags(
+    small_recipe: Recipe, full_pairs: list[Pair], tmp_path: Path
+) -> None:
+    own = small_recipe.drogue.model_copy(update={"name": "own", "rib_count": 7})
+    dataset = write_drawn_dataset(tmp_path / "own", small_recipe.model_copy(update={"drogue": own}), full_pairs[:1])
+    log, file = ExportLog(), tmp_path / "bags" / "drogue.toml"
+    bag, written = write_export("rosbag", dataset, tmp_path / "bags", log)
+    assert written == file and log.remarks == [f"import it with --drogue {file}"]
+    assert load_drogue(str(file)) == own
+    assert run(["import", str(bag), "--drogue", str(file), "--out", str(tmp_path / "imported")]) == DONE
 
 
 def test_a_bag_of_a_bayer_sensor_is_imported_with_its_mosaics(
