@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import groupby
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from datasets_manifest.storage.layout import BLIND_FILE
 from datasets_manifest.storage.reader import Dataset, read_shutter
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.storage.writer import canonical_json
-from datasets_manifest.types.estimates import PoseEstimate, read_estimates
+from datasets_manifest.types.estimates import TANGENT, PoseEstimate, read_estimates
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
@@ -41,6 +41,8 @@ from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
 from labelgen.export.frame_files import export_image
 
+# A roll of which nothing is known has a standard deviation of pi / sqrt(3); rings of markers bound it by far less.
+_OPEN_ROLL_SD_RAD = 1.0
 _SPEED_LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
 
 
@@ -219,18 +221,37 @@ def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates:
             if truth is not None:
                 writer.add(TRUTH_FOLDER, name, _line(truth, stamp_ns))
             for method, poses in methods.items():
-                pose = poses.get(frame_index)
-                if pose is None:
+                estimate = poses.get(frame_index)
+                if estimate is None:
                     log.lost(f"pairs in which {method} gives no pose are left out")
                     continue
-                if record is not None and truth is not None:
+                pose = estimate.pose
+                if estimate.is_roll_open:
+                    shown = "a placeholder" if truth is None else "the truth's"
+                    log.lost(f"poses of {method} leave the roll open: it is {shown}")
+                    pose = pose if truth is None else _with_roll_of(truth, pose)
+                elif record is not None and truth is not None:
                     pose = _nearest_turn(pose, truth, _turns(record))
                 writer.add(method, name, _line(pose, stamp_ns))
     return writer.names
 
 
-def _poses_by_method(estimates: Path) -> dict[str, dict[int, RigidTransform]]:
-    methods: dict[str, dict[int, RigidTransform]] = {}
+class _Estimated(NamedTuple):
+    """A pose, and whether its roll about the drogue's axis is unknown."""
+
+    pose: RigidTransform
+    is_roll_open: bool
+
+
+def _is_roll_open(estimate: PoseEstimate) -> bool:
+    if estimate.covariance is None or estimate.tangent != TANGENT:
+        return False
+    axis = estimate.left_from_drogue.rotation[:, 2]
+    return float(axis @ np.asarray(estimate.covariance)[3:, 3:] @ axis) > _OPEN_ROLL_SD_RAD**2
+
+
+def _poses_by_method(estimates: Path) -> dict[str, dict[int, _Estimated]]:
+    methods: dict[str, dict[int, _Estimated]] = {}
     for estimate in read_estimates(estimates):
         if _FOLDER_NAME.fullmatch(estimate.method) is None or estimate.method == TRUTH_FOLDER:
             raise ValueError(f"{estimates}: method {estimate.method!r} cannot be a folder")
@@ -238,7 +259,7 @@ def _poses_by_method(estimates: Path) -> dict[str, dict[int, RigidTransform]]:
         if estimate.frame_index in poses:
             raise ValueError(f"{estimates}: method {estimate.method!r}: frame {estimate.frame_index} occurs twice")
         if isinstance(estimate, PoseEstimate):
-            poses[estimate.frame_index] = estimate.left_from_drogue
+            poses[estimate.frame_index] = _Estimated(estimate.left_from_drogue, _is_roll_open(estimate))
     if not methods:
         raise ValueError(f"{estimates}: holds no estimates")
     return methods
@@ -274,6 +295,14 @@ def _nearest_turn(pose: RigidTransform, truth: RigidTransform, turns: NDArray[np
     # The angle between two attitudes is the smaller, the larger the trace of their quotient.
     nearest = int(np.einsum("ij,nij->n", truth.rotation, turned).argmax())
     return RigidTransform(turned[nearest], pose.translation_m)
+
+
+def _with_roll_of(truth: RigidTransform, pose: RigidTransform) -> RigidTransform:
+    """The pose, turned about its drogue's axis to the attitude nearest the truth's."""
+    apart = truth.rotation.T @ pose.rotation
+    # The turn that makes the trace of their quotient largest.
+    roll_rad = np.arctan2(apart[0, 1] - apart[1, 0], apart[0, 0] + apart[1, 1])
+    return RigidTransform(pose.rotation @ Rotation.from_euler("z", roll_rad).as_matrix(), pose.translation_m)
 
 
 class _TrajectoryFolders:

@@ -80,6 +80,31 @@ def test_every_pose_has_the_time_and_the_attitude_of_the_truth(dataset: Path, tm
     assert log.losses["pairs in which joint gives no pose are left out"] >= 1
 
 
+def test_a_roll_that_an_estimate_leaves_open_is_no_error(dataset: Path, tmp_path: Path) -> None:
+    """A rim has no roll: the pose has roll 0, and a covariance that says how little that means."""
+    source, estimates = Dataset(dataset), tmp_path / "estimates.jsonl"
+    fixes: list[Estimate] = []
+    for index in source.frame_indices:
+        pose = source.record(index).left_from_drogue
+        if pose is None:
+            continue
+        yaw, pitch, _ = Rotation.from_matrix(pose.rotation).as_euler("YXZ")
+        without_roll = RigidTransform(Rotation.from_euler("YXZ", [yaw, pitch, 0.0]).as_matrix(), pose.translation_m)
+        axis, covariance = pose.rotation[:, 2], 1e-4 * np.eye(6)
+        covariance[3:, 3:] += np.pi**2 / 3 * np.outer(axis, axis)
+        fixes.append(
+            PoseEstimate(frame_index=index, method="joint-rim", left_from_drogue=without_roll, covariance=covariance)
+        )
+    write_estimates(estimates, fixes)
+    log = ExportLog()
+    folders = write_export("tum", dataset, tmp_path / "out", log, estimates=estimates)
+    truth, rim = (numbers(folder / "single_pairs.txt") for folder in folders)
+    between = Rotation.from_quat(truth[:, 4:]).inv() * Rotation.from_quat(rim[:, 4:])
+    # Roundings of matrices and quaternions.
+    assert between.magnitude().max() < 1e-7
+    assert log.losses["poses of joint-rim leave the roll open: it is the truth's"] == len(fixes)
+
+
 def test_pairs_without_a_drogue_are_counted_beside_estimates(mixed_dataset: Path, tmp_path: Path) -> None:
     log, estimates = ExportLog(), estimates_of(mixed_dataset, tmp_path / "estimates.jsonl")
     truth, *_ = write_export("tum", mixed_dataset, tmp_path / "out", log, estimates=estimates)
