@@ -28,10 +28,12 @@ import torch
 from torch.utils.data import Dataset as MapDataset
 from torch.utils.data import IterableDataset, get_worker_info
 
+from datasets_manifest.atomic import try_lock
 from datasets_manifest.random_streams import sample_generator
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
-from datasets_manifest.storage.frame_store import FrameStore
-from datasets_manifest.storage.layout import RECORD_FILE, frame_name
+from datasets_manifest.storage.frame_store import FrameStore, list_frames
+from datasets_manifest.storage.layout import EVENTS_FILE, RECORD_FILE, frame_name
+from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import Pixels, StereoImages
@@ -41,7 +43,8 @@ from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset, StereoPair, stored_pair
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.progress import progress_report
-from droguekit.batch.resume import open_dataset
+from droguekit.batch.render_dataset import describe_dataset
+from droguekit.batch.resume import join_build, open_dataset
 from render.device import Device
 from render.engine import engine_notice
 
@@ -165,8 +168,9 @@ class RenderStream(IterableDataset[Any]):
     """Renders a recipe's frames while a training uses them.
 
     Each process of a data loader, and each rank of a distributed training, renders its own part of the frames, one
-    after the other, and shows earlier ones again in between. What it renders goes to a cache on disk, which is a
-    dataset: the next epoch reads it, and `droguekit render` completes it.
+    after the other, and shows earlier ones again in between. What it renders goes to a cache on disk, which the next
+    epoch reads. Once all frames of a rank are there, the end of an iteration makes its cache a dataset, and
+    `droguekit merge` joins those of several ranks; `droguekit render` completes and describes it at any time.
 
     The order is a function of the recipe's seed, the epoch and the number of processes, not of how fast anything runs.
 
@@ -240,7 +244,7 @@ class RenderStream(IterableDataset[Any]):
 
         Raises:
             ValueError: a frame cannot be rendered.
-            OSError: a frame cannot be written.
+            OSError: a frame or the description of the cache cannot be written.
         """
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
@@ -254,6 +258,18 @@ class RenderStream(IterableDataset[Any]):
                 task(frame_index)
             sample = sample_of_pair(stored_pair(reader, frame_index), keypoints=_most_markers(self._recipe))
             yield sample if self._transform is None else self._transform(sample)
+        self._describe(reader.manifest, range(self._rank * workers, (self._rank + 1) * workers), self._ranks * workers)
+
+    def _describe(self, manifest: Manifest, own_shards: range, shards: int) -> None:
+        """Write manifest and annotations of the cache, once no process has a frame of this rank to make any more."""
+        own = {index for index in range(self._recipe.frames.count) if index % shards in own_shards}
+        if own <= {entry.frame_index for entry in manifest.frames} or not own <= set(list_frames(self.cache)):
+            return
+        with (self.cache / EVENTS_FILE).open("a", encoding="utf-8") as events:
+            # Two processes may end at the same time: either describes the same frames.
+            if try_lock(events):
+                made_by = join_build(self.cache, manifest)[0] if manifest.frames else None
+                describe_dataset(self._recipe, self.cache, (), made_by)
 
     def frame_order(self, shard: int, shards: int, start: int = 0) -> Iterator[int]:
         """Indices of the frames that one of several processes shows in this epoch.

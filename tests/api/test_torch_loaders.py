@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import shutil
 from collections import Counter
@@ -16,11 +17,15 @@ from torch.utils.data import DataLoader
 
 import droguekit
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
-from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
+from datasets_manifest.storage.layout import MANIFEST_FILE, RECORD_FILE, frame_folder
+from datasets_manifest.storage.manifest import read_manifest
 from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset
+from droguekit.batch.merge_shards import merge_shards
+from droguekit.batch.progress import PlainProgress
 from droguekit.batch.resume import open_dataset
 from droguekit.torch import PairDataset, RenderStream, sample_of_pair
+from labelgen.validation.dataset_checks import validate_dataset
 from tests.support.changed_records import with_another_pose
 from tests.support.recipe_builder import build_recipe
 from tests.support.small_datasets import SINGLE_PAIRS
@@ -171,11 +176,26 @@ def test_ranks_and_processes_of_loaders_render_each_frame_once(
     recipe: Recipe, forks: BaseContext, tmp_path: Path
 ) -> None:
     frames: list[int] = []
-    for rank in range(2):
-        stream = RenderStream(recipe, tmp_path / "cache", rank=rank, ranks=2)
+    streams = [RenderStream(recipe, tmp_path / "cache", rank=rank, ranks=2) for rank in range(2)]
+    for stream in streams:
         loader: DataLoader[Any] = DataLoader(stream, batch_size=2, num_workers=2, multiprocessing_context=forks)
         frames += [index for batch in loader for index in batch["frame_index"].tolist()]
     assert sorted(frames) == list(range(12))
+    # Their caches are parts of the dataset that one run makes.
+    assert all(validate_dataset(stream.cache).passed for stream in streams)
+    merged = merge_shards(tmp_path / "merged", [stream.cache for stream in streams], PlainProgress(io.StringIO()))
+    whole = droguekit.render_dataset(recipe, tmp_path / "whole", workers=0)
+    assert merged.dataset_sha256 == whole.reader.manifest.dataset_sha256
+
+
+def test_a_cache_is_described_once_all_its_frames_are_there(recipe: Recipe, tmp_path: Path) -> None:
+    stream = RenderStream(recipe, tmp_path / "cache")
+    described = []
+    for _ in stream:
+        described.append(len(read_manifest(stream.cache).frames))
+    assert described == [0] * 12 and len(read_manifest(stream.cache).frames) == 12
+    written_ns = (stream.cache / MANIFEST_FILE).stat().st_mtime_ns
+    assert len(shown(stream)) == 12 and (stream.cache / MANIFEST_FILE).stat().st_mtime_ns == written_ns
 
 
 def test_ranks_that_start_at_the_same_time_do_not_lock_each_other_out(recipe: Recipe, tmp_path: Path) -> None:
