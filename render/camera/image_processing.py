@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec, Sensor
 from datasets_manifest.types.images import srgb_from_light
 from datasets_manifest.types.video_camera import ImageProcessing
 from geometry.compiled_loops import compiled
@@ -120,6 +120,12 @@ def tone_tables(processing: ImageProcessing, adc_bits: int, black_level_dn: int)
     tables: Plane = ((_LEVELS - 1) * np.clip(level, 0.0, 1.0)).astype(np.float32)
     tables.flags.writeable = False
     return tables
+
+
+def developed_black_dn(sensor: Sensor, processing: ImageProcessing) -> float:
+    """Level of pixels without light in the pictures of `develop`, rounded as there. [DN]"""
+    black = tone_tables(processing, sensor.adc_bits, sensor.black_level_dn)[1, sensor.black_level_dn]
+    return float(np.floor(black + np.float32(0.5)))
 
 
 def _blurred(plane: Plane, sigma_px: float) -> Plane:

@@ -19,7 +19,7 @@ from datasets_manifest.types.images import Pixels, StereoImages, srgb_from_light
 from datasets_manifest.types.video_camera import ImageProcessing
 from geometry.stereo import EYES, Eye
 from render.camera.image_coding import deliver
-from render.camera.image_processing import develop, metered
+from render.camera.image_processing import develop, developed_black_dn, metered
 from render.camera.optics import light_on_sensor
 from render.camera.sensor_readout import SensorReadout
 from render.engine import StereoRadiance
@@ -68,7 +68,11 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
         processing = metered(processing, frame, list(numbers.values()))
     for eye in EYES:
         images[eye] = _picture(numbers[eye], frame, processing)
-    black_level = _store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)
+    if processing is not None:
+        black_level_dn = developed_black_dn(sensor, processing)
+    else:
+        black = np.array([[sensor.black_level_dn]], dtype=np.uint16)
+        black_level_dn = float(_store(black, sensor, sensor.encoding)[0, 0])
     return StereoImages(
         left=images["left"],
         right=images["right"],
@@ -76,7 +80,7 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
         exposure_s=frame.exposure.time_s,
         bits=sensor.output_bits,
         encoding=sensor.encoding,
-        black_level_dn=float(black_level[0, 0]),
+        black_level_dn=black_level_dn,
         left_mosaic=mosaics["left"],
         right_mosaic=mosaics["right"],
     )

@@ -17,6 +17,7 @@ from datasets_manifest.types.video_camera import (
     ImageProcessing,
     LensFlaws,
     Overlay,
+    Spectrum,
     VideoCamera,
     Window,
 )
@@ -240,6 +241,18 @@ def test_processing_correlates_noise_as_in_photographs(
     noisy = with_camera(frame, camera, full_well_e=3000.0, responsivity_e_per_lux_s=3000.0)
     pair = expose(noisy, pair_of(flat_light(0.15), noisy))
     assert low <= lag_one(pair.left[..., 1], pair.right[..., 1]) <= high
+
+
+@pytest.mark.parametrize("spectrum", ["colour", "grey"])
+@pytest.mark.parametrize("black_fraction", [-0.02, 0.04])
+def test_the_black_level_is_what_a_picture_without_light_shows(
+    frame: FrameSpec, spectrum: Spectrum, black_fraction: float
+) -> None:
+    processing = PROCESSING.model_copy(update={"black_fraction": black_fraction})
+    dark = with_camera(frame, VideoCamera(spectrum=spectrum, processing=processing), noise_free=True)
+    images = expose(dark, pair_of(flat_light(0.0), dark))
+    assert set(np.unique(images.left)) == {images.black_level_dn}
+    assert images.black_level_dn == pytest.approx(255 * max(black_fraction, 0.0), abs=0.5)  # rounding
 
 
 @pytest.mark.parametrize("level", [0.01, 0.15, 0.6])
