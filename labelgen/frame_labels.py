@@ -260,13 +260,14 @@ def signal_to_noise(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance) -> flo
 
 
 def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
-    """(..., C) mean electrons of the sensor's channels, at most a full well."""
+    """(..., C) mean electrons of the sensor's channels, at most a full well or what the gain takes to white."""
     light = radiance_cd_m2.astype(np.float64)
     if frame.band_nm is not None:
         light = infrared_light(light, frame.band_nm)[..., None]
     elif frame.is_monochrome:
         light = light @ mono_weights(None).T
-    electrons: Array = np.clip(light * frame.sensor.electrons_per_cd_m2(frame.exposure), 0.0, frame.sensor.full_well_e)
+    most_e = frame.sensor.full_well_e / max(frame.exposure.gain, 1.0)
+    electrons: Array = np.clip(light * frame.sensor.electrons_per_cd_m2(frame.exposure), 0.0, most_e)
     return electrons
 
 

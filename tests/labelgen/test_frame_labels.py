@@ -17,6 +17,7 @@ from geometry.stereo import EYES
 from labelgen.disc_images import marker_discs
 from labelgen.frame_labels import label_frame, signal_to_noise
 from labelgen.part_pixels import drogue_box, drogue_hull_m, mask_box
+from render.camera.optics import saturation_cd_m2
 from render.camera.sensor import dn_per_electron, expose
 from render.engine import EyeRadiance
 from tests.support.drawn_pairs import Pair
@@ -217,6 +218,20 @@ def test_signal_to_noise_is_that_of_the_cameras_band(full_pairs: list[Pair], spe
     for disc in marker_discs(marker_layout(frame.drogue), frame.rig, frame.left_from_drogue, "left"):
         # The picture has 8 bits; in the wrong band the contrast is off by a factor of two and more.
         assert signal_to_noise(frame, disc, seen) == pytest.approx(want, rel=0.03)
+
+
+@pytest.mark.parametrize(("gain", "longer"), [(1.0, 16.0), (16.0, 1.0)])
+def test_a_white_picture_has_no_contrast(full_pairs: list[Pair], gain: float, longer: float) -> None:
+    """Whether the sites are full or the converter clips what the gain makes of their electrons."""
+    frame, seen = full_pairs[-1].frame, full_pairs[-1].radiance.left
+    exposure = frame.exposure.model_copy(update={"gain": gain, "time_s": longer * frame.exposure.time_s})
+    frame = frame.model_copy(update={"exposure": exposure})
+    is_marker = (seen.part_id >= FIRST_MARKER_ID)[..., None]
+    light = np.float32(saturation_cd_m2(frame)) * np.where(is_marker, np.float32(8.0), np.float32(1.1))
+    seen = replace(seen, radiance_cd_m2=np.repeat(light, 3, axis=2))
+    assert frame.drogue is not None and frame.left_from_drogue is not None
+    for disc in marker_discs(marker_layout(frame.drogue), frame.rig, frame.left_from_drogue, "left"):
+        assert signal_to_noise(frame, disc, seen) == 0.0
 
 
 def test_other_images_are_refused(full_pairs: list[Pair]) -> None:
