@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-RENDER_VERSION = "21"
+RENDER_VERSION = "22"

@@ -7,6 +7,7 @@ import numpy as np
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.camera_ranges import CameraRanges
 from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.video_camera import (
     ImageCoding,
@@ -20,6 +21,8 @@ from datasets_manifest.types.video_camera import (
 from drogue_models.parameters import WHITE_PAINT
 from scenes.environment_sampling import sample_uniform
 
+# Of a sensor behind an infrared filter to its band, against that to the visible.
+_NEAR_INFRARED_SENSITIVITY = SENSORS["mono-850"].responsivity_e_per_lux_s / SENSORS["mono"].responsivity_e_per_lux_s
 # Reflectance that a picture shows as mid-grey (the grey card of photography).
 _GREY_CARD = 0.18
 
@@ -56,6 +59,8 @@ def _sample_lens(rng: np.random.Generator, ranges: CameraRanges, sensor: Sensor)
         spectrum = "near-infrared"
     low, high = np.log(ranges.full_well_fraction.low), np.log(ranges.full_well_fraction.high)
     size = float(np.exp(rng.uniform(low, high)))
+    is_filtered = spectrum == "near-infrared" and sensor.band_nm is None
+    sensitivity = _NEAR_INFRARED_SENSITIVITY if is_filtered else 1.0
     optics = sensor.optics.model_copy(
         update={
             "natural_vignetting": True,
@@ -66,7 +71,7 @@ def _sample_lens(rng: np.random.Generator, ranges: CameraRanges, sensor: Sensor)
     changed = sensor.model_copy(
         update={
             "full_well_e": sensor.full_well_e * size,
-            "responsivity_e_per_lux_s": sensor.responsivity_e_per_lux_s * size,
+            "responsivity_e_per_lux_s": sensor.responsivity_e_per_lux_s * size * sensitivity,
             "psf_sigma_px": sample_uniform(rng, ranges.psf_sigma_px),
             "optics": optics,
         }

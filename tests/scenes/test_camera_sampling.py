@@ -73,6 +73,22 @@ def test_a_grey_card_is_mid_grey_in_the_picture(level: float) -> None:
     assert light_from_srgb(np.array(shown)) == pytest.approx(0.18, rel=0.002)
 
 
+def test_a_near_infrared_camera_is_as_sensitive_as_the_shipped_one() -> None:
+    """The meter gives both one time, also where the rig has a filter of its own."""
+    drawn = {"grey_scene_fraction": 0, "near_infrared_scene_fraction": 1, "full_well_fraction": 1}
+    rigs = ({"preset": preset, "encoding": "gamma"} for preset in ("mono-850", "mono", "rgb-ideal", "mono-850"))
+    cameras: tuple[dict[str, object], ...] = ({"near_infrared_scene_fraction": 0}, drawn, drawn, drawn)
+    frames = [
+        sample_frame(build_recipe(BASE, rig=rig, camera=camera), 3) for rig, camera in zip(rigs, cameras, strict=True)
+    ]
+    for frame in frames:
+        assert frame.band_nm == 850.0
+        responsivity = frame.sensor.responsivity_e_per_lux_s * frames[0].sensor.full_well_e / frame.sensor.full_well_e
+        assert responsivity == pytest.approx(frames[0].sensor.responsivity_e_per_lux_s, rel=1e-12)
+        # Only float64 rounds.
+        assert frame.exposure.time_s == pytest.approx(frames[0].exposure.time_s, rel=1e-12)
+
+
 def test_families_have_cameras_of_their_own() -> None:
     text_of_family = {"name": "night", "camera": {"processed_scene_fraction": 0.0}}
     table = build_recipe(BASE, camera={"grey_scene_fraction": 0.5}, families=[text_of_family])
