@@ -25,7 +25,8 @@ _CORE_RAD = 0.01
 _WIDEST_RAD = np.pi / 2
 # A hood shades the front lens from a sun this far off the axis: completely beyond the second angle.
 _HOOD_BEGINS_RAD, _HOOD_ENDS_RAD = np.radians(25.0), np.radians(45.0)
-_DARKEST_LUX = 1.0
+# By less, a clean lens's veil is at its brightest a tenth of the light of the night sky.
+_DARKEST_LUX = 1e-5
 # Beyond four sigma the Gaussian holds less than 1e-4 of the light.
 _KERNEL_REACH_SIGMA = 4.0
 # A smaller blur circle adds less than a 500th to the variance of a pixel's own box.

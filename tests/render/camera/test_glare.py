@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets_manifest.types.environment import CloudLayer
+from datasets_manifest.types.environment import CloudLayer, Moon
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.video_camera import VideoCamera, Window
 from geometry.distortion import BrownConrady, Lens
@@ -17,7 +17,8 @@ from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.photometry import luminance
+from scenes.sky.photometry import SOLAR_ILLUMINANCE_LUX, luminance
+from scenes.sky.sky_models import moon_illuminance_lux
 from tests.support.recipe_builder import paper_view_recipe
 
 
@@ -139,6 +140,17 @@ def test_no_veil_from_behind_at_night_or_from_a_hidden_sun() -> None:
     assert sun_glare(inside, eye(inside, coverage=1.0), "left") is None
 
 
+def test_the_moon_has_a_veil_as_the_sun_has() -> None:
+    night, moon = with_sun(-30.0, 0.0), Moon(elevation_deg=14.0, azimuth_deg=0.0, phase_angle_deg=0.0)
+    night = night.model_copy(update={"environment": night.environment.model_copy(update={"moon": moon})})
+    day = with_sun(14.0, 0.0)
+    by_moon, by_sun = (sun_glare(frame, eye(frame), "left") for frame in (night, day))
+    assert by_moon is not None and by_sun is not None
+    # Float32; the moon's light passes the same air.
+    np.testing.assert_allclose(by_moon, by_sun * moon_illuminance_lux(0.0) / SOLAR_ILLUMINANCE_LUX, rtol=1e-5)
+    assert light_on_sensor(night, eye(night), "left").max() > 0
+
+
 def test_clouds_that_a_flying_camera_passes_take_the_glare() -> None:
     frame = with_sun(20.0, 0.0)
     heap = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=3.0,
@@ -150,6 +162,6 @@ def test_clouds_that_a_flying_camera_passes_take_the_glare() -> None:
         passing = frame.model_copy(update={"environment": frame.environment.model_copy(update=update)})
         shares.append(1.0 - opacity_towards(heap, beam, (east_m, 0.0)))
         veil = sun_glare(passing, eye(passing), "left")
-        # Float32; a veil by less than 1 lux is left out.
-        np.testing.assert_allclose(0.0 if veil is None else veil, shares[-1] * clear, rtol=1e-5, atol=1e-2)
+        # Float32; a veil by less than 1e-5 lux is left out.
+        np.testing.assert_allclose(0.0 if veil is None else veil, shares[-1] * clear, rtol=1e-5, atol=1e-4)
     assert max(shares) - min(shares) > 0.5
