@@ -96,19 +96,21 @@ class LayeredAir:
     @cached_property
     def beam_share(self) -> float:
         """Share of the beam that cloud and mist transmit to the camera."""
-        direction, offset_m = self._sky.beam.direction, self._environment.camera_offset_m
-        share = 1.0
-        for layer in self._environment.clouds:
-            share *= 1.0 - opacity_towards(layer, direction, offset_m, self.round_horizon_sine)
-        return share * self._mist_beam_share
+        return self.open_share(self._sky.beam.direction)
 
-    @property
-    def _mist_beam_share(self) -> float:
-        mist = self._environment.mist
+    def open_share(self, direction: NDArray[np.float64]) -> float:
+        """Share of the light from a far source that cloud and mist transmit to the camera.
+
+        Args:
+            direction: (3,) unit vector in world axes towards the source.
+        """
+        share, mist = 1.0, self._environment.mist
+        for layer in self._environment.clouds:
+            share *= 1.0 - opacity_towards(layer, direction, self._environment.camera_offset_m, self.round_horizon_sine)
         if mist is None:
-            return 1.0
-        sine = max(float(self._sky.beam.direction[2]), _LOWEST_BEAM_SINE)
-        return float(np.exp(-mist.extinction_per_m * mist.above_m / sine))
+            return share
+        sine = max(float(direction[2]), _LOWEST_BEAM_SINE)
+        return share * float(np.exp(-mist.extinction_per_m * mist.above_m / sine))
 
     def light_on(self, layer: CloudLayer) -> CloudLight:
         """Light on a cloud layer through the layers above it and from those below."""

@@ -128,7 +128,7 @@ class EnvironmentRadiance:
 
     def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
         """Add sun and moon behind land, cloud and mist, in place, to (H, W, 3) radiance along directions."""
-        self.sky.add_discs(radiance, directions, self.air.beam_share * self._share_above_ground(directions))
+        self.sky.add_discs(radiance, directions, self._share_above_ground(directions), self.air.open_share)
 
     def _share_above_ground(self, directions: NDArray[np.float32]) -> float | NDArray[np.float64]:
         """(H, W) share of each pixel that ground leaves open, or 1 if no disc of sun or moon is near ground."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -155,14 +156,19 @@ class ClearSky:
         return any(_meets_disc(luminary, directions).any() for luminary in self.luminaries)
 
     def add_discs(
-        self, radiance: Radiance, directions: NDArray[np.float32], through: float | NDArray[np.floating[Any]]
+        self,
+        radiance: Radiance,
+        directions: NDArray[np.float32],
+        through: float | NDArray[np.floating[Any]],
+        share_towards: Callable[[NDArray[np.float64]], float] | None = None,
     ) -> None:
         """Add the discs of sun and moon, in place.
 
         Args:
             radiance: (..., 3) along `directions`. [cd/m2]
             directions: (..., 3) unit vectors in world axes.
-            through: share of the beam that is not stopped on its way; a number, or (...).
+            through: share of both beams that is not stopped on its way; a number, or (...).
+            share_towards: a further share, of the beam from the (3,) direction of each; None for all of it.
         """
         through = np.broadcast_to(through, directions.shape[:-1])
         for luminary in self.luminaries:
@@ -173,9 +179,10 @@ class ClearSky:
             if luminary is self.moon and self._moon is not None:
                 lit = self._lit_moon(directions[disc])
                 area_sr *= 0.5 * (1.0 + np.cos(np.radians(self._moon.phase_angle_deg)))
-            lux = self._disc_lux(luminary, directions[disc]) * through[disc][:, None]
-            share = lux / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
-            radiance[disc] += lit[:, None] * share.astype(np.float32)
+            share = 1.0 if share_towards is None else share_towards(luminary.direction)
+            lux = self._disc_lux(luminary, directions[disc]) * (share * through[disc])[:, None]
+            light = lux / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
+            radiance[disc] += lit[:, None] * light.astype(np.float32)
 
     def _visible(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(...) which directions are above the level horizon."""

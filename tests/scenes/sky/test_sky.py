@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer, Environment, Moon
+from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.photometry import (
@@ -210,6 +211,29 @@ def test_full_moon_is_as_bright_as_measured_and_fades_with_its_phase() -> None:
     assert 0.1 < level_illuminance_lux(sky) < 0.27
     assert 0.07 < moon_illuminance_lux(90.0) / moon_illuminance_lux(0.0) < 0.12
     assert moon_illuminance_lux(180.0) < 0.001
+
+
+def test_a_cloud_hides_the_luminary_that_is_behind_it() -> None:
+    """A moon by day behind cloud beside a sun in a gap, and the other way round."""
+    heap = CloudLayer(kind="cumulus", height_above_camera_m=1500.0, cover_fraction=0.5, feature_size_m=2500.0,
+                      optical_depth=14.0, texture_seed=0)  # fmt: skip
+    bearings = np.arange(0.0, 360.0, 10.0)
+    opacity = [opacity_towards(heap, direction_from_angles(40.0, azimuth_deg)) for azimuth_deg in bearings]
+    behind, beside = bearings[int(np.argmax(opacity))], bearings[int(np.argmin(opacity))]
+    assert max(opacity) > 0.999 and min(opacity) < 0.001
+    shares = []
+    for moon_deg, sun_deg in ((behind, beside), (beside, behind)):
+        moon = Moon(elevation_deg=40.0, azimuth_deg=moon_deg)
+        clouded = environment(sun_elevation_deg=40.0, sun_azimuth_deg=sun_deg, moon=moon, clouds=(heap,))
+        around = EnvironmentRadiance(clouded)
+        for luminary in around.sky.luminaries:
+            seen, ray = np.zeros((1, 1, 3), np.float32), luminary.direction.astype(np.float32)[None, None]
+            around.add_discs(seen, ray)
+            whole = np.zeros((1, 1, 3), np.float32)
+            around.sky.add_discs(whole, ray, 1.0)
+            shares.append(float(seen.sum() / whole.sum()))
+    # Sun in the gap, moon behind; then sun behind, moon in the gap.
+    np.testing.assert_allclose(shares, [1.0, 0.0, 0.0, 1.0], atol=1e-3)
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 90.0, 120.0])
