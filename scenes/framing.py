@@ -8,7 +8,7 @@ from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
-from geometry.stereo import StereoRig
+from geometry.stereo import EYES, StereoRig
 from scenes.environment_sampling import sample_uniform
 
 _MOST_TRIES = 1000
@@ -55,16 +55,20 @@ def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[fl
     return None if x_low > x_high or y_low > y_high else (float(x_low), float(x_high), float(y_low), float(y_high))
 
 
-def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth_m: float) -> RigidTransform:
+def sample_pose(
+    rng: np.random.Generator, recipe: Recipe, points_m: Array, depth_m: float, *, shows_front: bool = False
+) -> RigidTransform:
     """Pose in the left camera at one depth: attitude from the recipe's ranges, position uniform in the common view.
 
-    An attitude that does not fit into both views at this depth is drawn again.
+    An attitude that does not fit into both views at this depth is drawn again, and one that shows a back where it must
+    not.
 
     Args:
         rng: of the frame.
         recipe: gives rig and ranges.
         points_m: (M, 3) points around all that must be in view, in its own frame. [m]
         depth_m: Z of that frame's origin. [m]
+        shows_front: whether the origin's plane must show both eyes the side that z points away from.
 
     Raises:
         ValueError: no attitude within the ranges fits.
@@ -83,12 +87,15 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth
             continue
         x_low, x_high, y_low, y_high = bounds
         if recipe.pose.on_axis:
-            middle = np.array([recipe.rig.baseline_m / 2, 0.0, depth_m])
-            if not (x_low <= middle[0] <= x_high and y_low <= middle[1] <= y_high):
+            origin_m = np.array([recipe.rig.baseline_m / 2, 0.0, depth_m])
+            if not (x_low <= origin_m[0] <= x_high and y_low <= origin_m[1] <= y_high):
                 continue
-            return RigidTransform(rotation, middle)
-        x_m, y_m = x_low + place[0] * (x_high - x_low), y_low + place[1] * (y_high - y_low)
-        return RigidTransform(rotation, np.array([x_m, y_m, depth_m]))
+        else:
+            x_m, y_m = x_low + place[0] * (x_high - x_low), y_low + place[1] * (y_high - y_low)
+            origin_m = np.array([x_m, y_m, depth_m])
+        if shows_front and any((origin_m - recipe.rig.eye_offset_m(eye)) @ rotation[:, 2] <= 0 for eye in EYES):
+            continue
+        return RigidTransform(rotation, origin_m)
     raise ValueError(
         f"pose: at {depth_m:g} m no attitude within the recipe's ranges keeps all in both views; "
         "widen pitch_deg and yaw_deg towards 0 or move away"

@@ -278,6 +278,7 @@ def _placed_board(scene_recipe: Recipe, frame_index: int) -> PlacedBoard | None:
         scene_recipe,
         scene_recipe.board.outline_m(),
         distance_m,
+        shows_front=True,
     )
     return PlacedBoard(shape=scene_recipe.board, left_from_board=pose)
 

@@ -121,6 +121,26 @@ def test_the_whole_drogue_is_in_both_views(distance_m: float) -> None:
             assert frame.rig.camera.contains(frame.rig.project(rim, eye), margin_px=0.5).all()
 
 
+def test_calibration_boards_show_their_front_to_both_eyes() -> None:
+    """Also where the view is so wide that boards turned away fit into it."""
+    angles = {"pitch_deg": [-60, 60], "yaw_deg": [-60, 60]}
+    drawn = recipe(
+        rig={"preset": "rgb-ideal", "focal_px": 600.0},
+        board={},
+        frames={"empty_fraction": 1, "scenes": 1},
+        distance=between(3.0, 6.0),
+        pose=angles,
+        exposure={"time_s": 1e-3},
+        render={"engine": "analytic"},
+    )
+    for index in range(60):
+        frame = sample_frame(drawn, index)
+        assert frame.board is not None
+        pose = frame.board.left_from_board
+        for eye in EYES:
+            assert (pose.translation_m - frame.rig.eye_offset_m(eye)) @ pose.rotation[:, 2] > 0
+
+
 def test_places_fill_the_common_field() -> None:
     drawn = recipe(distance=stations(10.0))
     places = np.array([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(200)])
