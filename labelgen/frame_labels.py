@@ -27,6 +27,7 @@ from labelgen.disc_images import DiscInEye, hub_discs, marker_discs, window_arou
 from labelgen.part_pixels import drogue_box, drogue_mask, is_truncated, mask_box
 from render.camera.sensor import mono_weights
 from render.engine import EyeRadiance, StereoRadiance
+from scenes.environment_radiance import sun_elevation_deg
 from scenes.sky.photometry import REC709_LUMINANCE, infrared_light
 
 # A feature's background reaches from its edge to this multiple of its radius.
@@ -70,7 +71,7 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
         conditions=Conditions(
             family=frame.family,
             distance_m=None if pose is None else float(pose.translation_m[2]),
-            sun_elevation_deg=frame.environment.sun_elevation_deg,
+            sun_elevation_deg=sun_elevation_deg(frame.environment),
             background_luminance_cd_m2=_background_luminance_cd_m2(radiance),
             monte_carlo_noise_fraction=radiance.monte_carlo_noise_fraction,
             monte_carlo_over_sensor_noise=radiance.monte_carlo_over_sensor_noise,

@@ -376,6 +376,17 @@ class MappedEnvironmentRadiance(EnvironmentRadiance):
         return self._coarse.radiance(level.reshape(1, -1, 3)).reshape(level.shape)
 
 
+def sun_elevation_deg(environment: Environment) -> float | None:
+    """Elevation of the sun, or None where the environment's map shows none. [deg]
+
+    Raises:
+        ValueError: the map cannot be read, or has changed.
+    """
+    if environment.map is not None and load_map(environment.map).sun_lux.max() <= 0:
+        return None
+    return environment.sun_elevation_deg
+
+
 # The frames of a scene are made in a row.
 @lru_cache(maxsize=16)
 def _of_scene(key: str, folder: Path | None) -> EnvironmentRadiance:

@@ -90,13 +90,14 @@ class Conditions(FrozenModel):
     """Conditions by which reports group frames.
 
     Attributes:
+        sun_elevation_deg: of the scene's sun; None where an environment map shows none. [deg]
         markers_in_view, hub_in_view: of a sequence's pair, by eye: number of markers wholly inside the image, and
             whether the hub is, regardless of occlusion.
     """
 
     family: str
     distance_m: float | None
-    sun_elevation_deg: float
+    sun_elevation_deg: float | None
     background_luminance_cd_m2: float
     monte_carlo_noise_fraction: float
     monte_carlo_over_sensor_noise: float | None = None

@@ -73,14 +73,14 @@ class LightPrediction:
 
     Attributes:
         light: `day`, `dusk` or `night`.
-        sun_elevation_deg: of the sun.
+        sun_elevation_deg: of the sun; None where an environment map shows none.
         sky_cd_m2, face_cd_m2, marker_cd_m2: luminance in the direction of the drogue, of the face and of a marker; for
             a sensor behind an infrared filter the light in its band, in units of sunlight.
         exposure_s, gain: of both eyes.
     """
 
     light: str
-    sun_elevation_deg: float
+    sun_elevation_deg: float | None
     sky_cd_m2: float
     face_cd_m2: float
     marker_cd_m2: float
@@ -143,8 +143,9 @@ def check_lines(check: RecipeCheck) -> Iterator[str]:
     """The predictions as a table, and what will fail."""
     yield f"{check.name}: predicted, with the drogue on the cameras' axis"
     for light in check.lights:
+        sun = "no sun" if light.sun_elevation_deg is None else f"sun at {light.sun_elevation_deg:g} deg"
         yield (
-            f"{light.light}: sun at {light.sun_elevation_deg:g} deg, sky {light.sky_cd_m2:.3g} cd/m2, face "
+            f"{light.light}: {sun}, sky {light.sky_cd_m2:.3g} cd/m2, face "
             f"{light.face_cd_m2:.3g}, markers {light.marker_cd_m2:.3g}; exposure {1e3 * light.exposure_s:.3g} ms, "
             f"gain {light.gain:g}"
         )
@@ -203,10 +204,11 @@ class _Scene:
         return replace(self, lamp=luminance_cd_m2 * self.unit_lamp)
 
     def told(self, light: str) -> LightPrediction:
+        from scenes.environment_radiance import sun_elevation_deg
         from scenes.sky.photometry import light_in_band
 
         sky, face, marker = (float(light_in_band(each, self.band_nm)) for each in (self.sky, self.face, self.marker))
-        elevation_deg = self.environment.sun_elevation_deg
+        elevation_deg = sun_elevation_deg(self.environment)
         return LightPrediction(light, elevation_deg, sky, face, marker, self.exposure.time_s, self.exposure.gain)
 
 

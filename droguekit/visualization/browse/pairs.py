@@ -75,7 +75,7 @@ def conditions_table(record: PairRecord, split: str) -> list[tuple[str, str]]:
     if record.sequence_id is not None:
         rows.append(("Sequence, time", f"{record.sequence_id}, {record.time_s:.3f} s"))
     rows.append(("Background", f"{plain_number(conditions.background_luminance_cd_m2)} cd/m²"))
-    rows += _sky(frame.environment)
+    rows += _sky(frame.environment, conditions.sun_elevation_deg)
     exposure = frame.exposure
     rows.append(
         ("Exposure", f"{plain_number(1e3 * exposure.time_s)} ms, f/{exposure.f_number:g}, gain {exposure.gain:g}")
@@ -87,8 +87,11 @@ def conditions_table(record: PairRecord, split: str) -> list[tuple[str, str]]:
     return rows
 
 
-def _sky(sky: Environment) -> list[tuple[str, str]]:
-    rows = [("Sun", f"{plain_number(sky.sun_elevation_deg)}° high, azimuth {plain_number(sky.sun_azimuth_deg)}°")]
+def _sky(sky: Environment, sun_elevation_deg: float | None) -> list[tuple[str, str]]:
+    sun = "none"
+    if sun_elevation_deg is not None:
+        sun = f"{plain_number(sun_elevation_deg)}° high, azimuth {plain_number(sky.sun_azimuth_deg)}°"
+    rows = [("Sun", sun)]
     if sky.map is not None:
         rows.append(("Surroundings", "a picture of sky and ground"))
         return rows

@@ -14,7 +14,10 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import FrameSpec
-from scenes.environment_radiance import environment_radiance
+from labelgen.frame_labels import label_frame
+from render.camera.sensor import expose
+from render.engine import load_engine
+from scenes.environment_radiance import environment_radiance, sun_elevation_deg
 from scenes.sampler import sample_frame
 from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.photometry import SUN_SOLID_ANGLE_SR, luminance
@@ -99,7 +102,26 @@ def test_the_disc_is_drawn_where_the_sun_was(tmp_path: Path) -> None:
 
 def test_an_even_sky_has_no_sun(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture(sun=0))
-    assert load_map(environment(tmp_path).map).sun_lux.max() == 0
+    sunless = environment(tmp_path)
+    assert load_map(sunless.map).sun_lux.max() == 0
+    assert sun_elevation_deg(sunless) is None
+    assert sun_elevation_deg(sunless.model_copy(update={"map": None})) == sunless.sun_elevation_deg
+
+
+@pytest.mark.parametrize("sun", [0.0, 50_000.0])
+def test_records_tell_the_elevation_of_a_sun_that_a_map_shows(tmp_path: Path, sun: float) -> None:
+    write(tmp_path / "sky.exr", picture(sun=sun))
+    drawn = recipe(tmp_path)
+    frame = sample_frame(drawn, 0)
+    light = load_engine("analytic").render(frame, drawn.render)
+    record = label_frame(frame, light, expose(frame, light))
+    elevation_deg = record.conditions.sun_elevation_deg
+    if sun:
+        assert elevation_deg == pytest.approx(90 - 40.5 * 180 / HEIGHT, abs=1e-4)  # float32
+    else:
+        assert elevation_deg is None
+    text = record.model_dump_json()
+    assert type(record).model_validate_json(text).model_dump_json() == text
 
 
 def test_illuminance_is_as_asked_for(tmp_path: Path) -> None:
