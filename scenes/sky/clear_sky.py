@@ -21,6 +21,7 @@ from scenes.sky.photometry import (
 from scenes.sky.sky_models import (
     DaylightSky,
     TwilightSky,
+    daylight_illuminance_lux,
     lit_side_of_moon,
     moon_illuminance_lux,
     night_radiance,
@@ -29,9 +30,9 @@ from scenes.sky.sky_models import (
 
 # Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]
 _TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG = 2.0, 9.0
-# Preetham's sky is three times too bright under a low sun: between these elevations its level blends into the measured
-# one. [deg]
-_MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG = 4.0, 22.0
+# Preetham's sky sends up to three times too much light, so its level is another's: between these elevations that of a
+# daylight sky blends into that measured under low suns. [deg]
+_MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG = 4.0, 15.0
 # Below this elevation the sun's light is negligible beside the night sky. [deg]
 _NIGHT_BELOW_DEG = -18.5
 
@@ -64,10 +65,11 @@ class Luminary:
         brighter = 1.0
         if day > 0:
             sky = DaylightSky(turbidity, elevation_deg, azimuth_deg, altitude_m)
-            measured_lux, modelled_lux = twilight_illuminance_lux(elevation_deg), sky.level_illuminance_lux
+            measured_lux = twilight_illuminance_lux(elevation_deg)
             modelled = _smooth_step(elevation_deg, _MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG)
-            brighter = (modelled_lux / measured_lux) ** modelled
-            self._skies.append((day * brighter * measured_lux / modelled_lux, sky))
+            if modelled > 0:
+                brighter = (daylight_illuminance_lux(elevation_deg, turbidity) / measured_lux) ** modelled
+            self._skies.append((day * brighter * measured_lux / sky.level_illuminance_lux, sky))
         if day < 1 and elevation_deg > _NIGHT_BELOW_DEG:
             self._skies.append(((1.0 - day) * brighter, TwilightSky(turbidity, elevation_deg, azimuth_deg)))
 

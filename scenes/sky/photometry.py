@@ -99,18 +99,24 @@ def scattering_depth(turbidity: float) -> tuple[NDArray[np.float64], NDArray[np.
     return molecules, aerosol
 
 
+def air_mass(elevation_deg: float) -> float:
+    """Air in the direction of sun or moon above the horizon, in units of that overhead.
+
+    Source: Kasten 1966 (doi:10.1007/BF02248840).
+    """
+    return float(1.0 / (np.sin(np.radians(elevation_deg)) + 0.15 * (elevation_deg + 3.885) ** -1.253))
+
+
 def beam_transmission(elevation_deg: float, turbidity: float) -> NDArray[np.float64]:
     """(3,) share of the sun's or moon's light that air transmits directly, by channel; 0 once it has set.
 
-    Source: optical depths as in `scattering_depth`; air mass of Kasten 1966 (doi:10.1007/BF02248840).
+    Source: optical depths as in `scattering_depth`, through `air_mass`.
     """
     lifted_deg = elevation_deg + _REFRACTION_AT_HORIZON_DEG * np.exp(-max(elevation_deg, 0.0) / 1.5)
     radius_deg = float(np.degrees(SUN_RADIUS_RAD))
     risen = float(np.clip((lifted_deg + radius_deg) / (2 * radius_deg), 0.0, 1.0))
-    above_deg = max(lifted_deg, 0.0)
-    air_mass = 1.0 / (np.sin(np.radians(above_deg)) + 0.15 * (above_deg + 3.885) ** -1.253)
     molecules, aerosol = scattering_depth(turbidity)
-    result: NDArray[np.float64] = risen * np.exp(-(molecules + aerosol) * air_mass)
+    result: NDArray[np.float64] = risen * np.exp(-(molecules + aerosol) * air_mass(max(lifted_deg, 0.0)))
     return result
 
 

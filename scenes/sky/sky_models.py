@@ -22,7 +22,9 @@ from datasets_manifest.types.environment import Moon
 from scenes.sky.photometry import (
     REC709_FROM_XYZ,
     REC709_LUMINANCE,
+    SOLAR_ILLUMINANCE_LUX,
     Radiance,
+    air_mass,
     direction_from_angles,
     hemisphere,
     henyey_greenstein,
@@ -170,6 +172,29 @@ def twilight_illuminance_lux(sun_elevation_deg: float) -> float:
     mass = shell * (inner - sine) + inner
     sky = 0.0289 * np.exp(-0.042 * mass) * (1.0 + (sun_elevation_deg + 90.0) * sine / 57.29577951)
     return float(133_775.0 * sky)
+
+
+# Shares of what molecules and aerosol scatter that they send back up, and its power of the air mass: fitted to what the
+# sky of `sky_model = "scattering"` sends to ground of 0.1, for turbidities of 1.9 to 10 and suns from 10 degrees up.
+# The sky is within 14 % of it, 3 % in the mean of squares, and sky and beam together within 6 % up to a turbidity of 4.
+_BACK_BY_MOLECULES, _BACK_BY_AEROSOL, _BACK_POWER = 0.425, 0.224, 1.3
+
+
+def daylight_illuminance_lux(sun_elevation_deg: float, turbidity: float) -> float:
+    """Illuminance of level ground by the clear sky alone, under a sun well above the horizon. [lux]
+
+    Air that absorbs nothing transmits 1 / (1 + b tau m) of the light, b the share of what it scatters that goes back up
+    and tau m its optical depth; the sky sends what the beam does not. So both together are less than the sunlight
+    outside the air.
+
+    Source: the two-stream approximation of Coakley and Chylek 1975
+    (doi:10.1175/1520-0469(1975)032<0409:TTSAIR>2.0.CO;2), whose b depends on the angle too.
+    """
+    molecules, aerosol = (float(depth[1]) for depth in scattering_depth(turbidity))
+    mass = air_mass(sun_elevation_deg)
+    back = (_BACK_BY_MOLECULES * molecules + _BACK_BY_AEROSOL * aerosol) * mass**_BACK_POWER
+    through = 1.0 / (1.0 + back) - np.exp(-(molecules + aerosol) * mass)
+    return float(SOLAR_ILLUMINANCE_LUX * np.sin(np.radians(sun_elevation_deg)) * through)
 
 
 class TwilightSky:
@@ -326,8 +351,8 @@ def night_radiance(directions: NDArray[np.floating[Any]]) -> Radiance:
     up = np.clip(np.asarray(directions[..., 2], dtype=np.float32), 0.0, 1.0)
     shell = np.float32((_EARTH_M / (_EARTH_M + _AIRGLOW_HEIGHT_M)) ** 2)
     longer = 1.0 / np.sqrt(1.0 - shell * (1.0 - up * up))
-    air_mass = 1.0 / (up + 0.025 * np.exp(-11.0 * up))  # Rozenberg 1966
-    left = np.float32(10.0) ** (-0.4 * EXTINCTION_MAG * (air_mass - 1.0))
+    mass = 1.0 / (up + 0.025 * np.exp(-11.0 * up))  # Rozenberg 1966
+    left = np.float32(10.0) ** (-0.4 * EXTINCTION_MAG * (mass - 1.0))
     level = (_AIRGLOW_SHARE * longer + (1.0 - _AIRGLOW_SHARE)) * left + 0.35 * (1.0 - left)
     result: Radiance = (np.float32(_ZENITH_CD_M2) * level)[..., None].astype(np.float32) * _NIGHT_RGB
     return result
