@@ -212,7 +212,7 @@ def amodal_counts(
     alone_id: NDArray[np.uint8],
     alone_depth_m: NDArray[np.float32],
 ) -> dict[int, int]:
-    """Number of pixel centres that each marker and the hub would cover if nothing occluded it.
+    """Number of pixel centres that each marker and the hub would cover if nothing but another of them occluded it.
 
     A ray along the seam between a feature and the part that surrounds it may hit either. Both lie at one depth;
     then the hit in the whole scene counts, so that an unoccluded feature has as many amodal as visible pixels.

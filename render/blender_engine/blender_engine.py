@@ -36,6 +36,7 @@ from render.blender_engine.stage import Stage
 from render.compositing import TracedEye, amodal_counts
 from render.device import Device, driver_version
 from render.engine import EyeRadiance, StereoRadiance
+from render.hidden_features import add_hidden_centers
 from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
@@ -267,12 +268,15 @@ class BlenderEngine:
     def _amodal(self, path: EyePath, window: ImageWindow, traced: TracedEye, job: _EyeJob) -> dict[int, int]:
         alone = self._passes(path, window, FEATURES, job)
         inside = _slices(window)
-        return amodal_counts(
+        counts = amodal_counts(
             traced.part_id[inside].ravel(),
             traced.depth_m[inside].ravel(),
             alone.part_id.ravel(),
             alone.depth_m.ravel(),
         )
+        pixel = np.arange(traced.part_id.size).reshape(traced.part_id.shape)[inside].ravel()
+        seen = pixel, alone.part_id.ravel()
+        return add_hidden_centers(counts, job.frame, job.eye, self._stage.triangles_m, seen)
 
 
 def _noise_fraction(

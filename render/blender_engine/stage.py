@@ -21,6 +21,7 @@ from render.blender_engine.messages import (
     StageObjects,
     SurfaceAppearance,
 )
+from render.hidden_features import feature_triangles
 from render.surfaces import NEIGHBOUR_GROUP, FrameSurfaces, Surface, feature_surfaces, frame_surfaces
 from scenes.environment_radiance import EnvironmentRadiance
 
@@ -31,6 +32,7 @@ class Stage:
     Attributes:
         drogue_m: (V, 3) vertices of the drogue's own parts. [m]
         context_m: (V, 3) vertices of each other thing. [m]
+        triangles_m: of markers and hub, by part id; see `feature_triangles`.
         neighbours_m: those among them that are drogues, too. [m]
     """
 
@@ -38,6 +40,7 @@ class Stage:
         self._key: tuple[object, ...] | None = None
         self._paint: dict[str, NDArray[np.floating[Any]]] = {}
         self.drogue_m: NDArray[np.float32] = np.zeros((0, 3), dtype=np.float32)
+        self.triangles_m: dict[int, Array] = {}
         self.context_m: list[NDArray[np.float32]] = []
         self.neighbours_m: list[NDArray[np.float32]] = []
 
@@ -51,6 +54,7 @@ class Stage:
             stage = _stage_objects(surfaces, moved)
             corners = [stage.objects[name].vertices_m for name in surfaces.fixed]
             self.drogue_m = np.concatenate(corners) if corners else np.zeros((0, 3), dtype=np.float32)
+            self.triangles_m = feature_triangles(surfaces.fixed)
             self._key, self._paint = key, {}
         things: dict[str, list[NDArray[np.float32]]] = {}
         for name, surface in surfaces.moved.items():

@@ -17,6 +17,7 @@ from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import motion_blur_px, pose_polynomial, receiver_pixels
 from render.compositing import TracedEye, amodal_counts
+from render.hidden_features import add_hidden_centers
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.trace_request import (
     CONTEXT_DEPTH,
@@ -70,6 +71,10 @@ class ScalarTracer:
             slices = _MOVING_SLICES if moves_px >= 0.05 else 1
             halves = [_Half(view, scene, slices, seeds).light(plan, settings) for _ in range(2)]
             traced, pixel = _untraced_eye(seen[0], alone), _in_order(plan)
+            ids = alone[0].reshape(-1)
+            traced.amodal_px = add_hidden_centers(
+                traced.amodal_px, frame, eye, scene.triangles_m, (np.arange(ids.size), ids)
+            )
             mean, difference = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / np.float32(np.sqrt(2))
             eyes[eye] = traced.with_light(pixel, mean)
             # Differs from the mean by as much as two independent means of so many samples would.

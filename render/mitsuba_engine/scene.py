@@ -21,6 +21,7 @@ from datasets_manifest.atomic import scratch_folder
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import Sheen
 from geometry.se3 import RigidTransform
+from render.hidden_features import feature_triangles
 from render.mitsuba_engine.jit_arrays import jit_array, jit_tensor
 from render.surfaces import FrameSurfaces, Surface, feature_surfaces, frame_surfaces
 from scenes.environment_radiance import EnvironmentRadiance
@@ -75,6 +76,7 @@ class DrogueScene:
         scene: everything.
         features: markers and hub alone, for their amodal pixel counts.
         features_m: (V, 3) points in the stage's axes whose convex hull holds all of `features`. [m]
+        triangles_m: of `features`, by part id; see `feature_triangles`.
         object_corners_m: such points for each object in the frame. [m]
         lamp_corners_m: such points for each lamp among the moved objects. [m]
         uneven_parts: ids of the drogue's parts whose paint has edges of its own.
@@ -89,6 +91,7 @@ class DrogueScene:
     def __init__(self, surfaces: FrameSurfaces, keys: dict[str, _Key], shared: dict[_Key, SharedShape]) -> None:
         fronts = feature_surfaces(surfaces.fixed)
         self.features_m = _corners_m(fronts.values())
+        self.triangles_m = feature_triangles(surfaces.fixed)
         self._drogue_m = _corners_m(surface.painted.mesh for surface in surfaces.fixed.values())
         self.shapes: dict[_Key, SharedShape] = {}
         with scratch_folder() as folder:

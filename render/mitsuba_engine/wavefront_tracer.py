@@ -21,6 +21,7 @@ from geometry.compiled_loops import compiled
 from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px, receiver_pixels
 from render.compositing import Compositor, TracedEye, amodal_counts
+from render.hidden_features import add_hidden_centers
 from render.mitsuba_engine.jit_arrays import jit_array, reserve_registry
 from render.mitsuba_engine.paths.body_paths import DenoisedBodyPaths
 from render.mitsuba_engine.paths.context_paths import SeenContext, trace_context
@@ -208,7 +209,7 @@ class CenterPasses:
         self._rays, self._scene = rays, scene
         camera = frame.rig.camera
         self._shape = (camera.height_px, camera.width_px)
-        self._rig, self._eye = frame.rig, eye
+        self._frame, self._rig, self._eye = frame, frame.rig, eye
         self._held = np.zeros(self._shape, dtype=np.bool_)
 
     def hold(self, held: NDArray[np.bool_]) -> None:
@@ -325,7 +326,8 @@ class CenterPasses:
         if not len(pixel):
             return {}
         alone_id, alone_m = self._hits(self._scene.features, self._center_rays(jit_array(mi.UInt32, pixel)))
-        return amodal_counts(part_id.reshape(-1)[pixel], distance_m.reshape(-1)[pixel], alone_id, alone_m)
+        counts = amodal_counts(part_id.reshape(-1)[pixel], distance_m.reshape(-1)[pixel], alone_id, alone_m)
+        return add_hidden_centers(counts, self._frame, self._eye, self._scene.triangles_m, (pixel, alone_id))
 
 
 @compiled
