@@ -30,7 +30,7 @@ from drogue_models.untrusted_files import parse_json
 CONVENTIONS = {
     "transforms": "a_from_b takes coordinates in b to coordinates in a; 4x4, row-major",
     "camera_axes": "x right, y down, z forward",
-    "drogue_axes": "origin at the centre of the marker circle in the rim plane, z from the mouth to the hose",
+    "drogue_axes": "origin at the centre of the rim circle, z from the mouth to the hose",
     "world_axes": "x east, y north, z up",
     "body_axes": "x forward, y right, z down",
     "units": "metres, seconds, cd/m2; angles in degrees where a name ends in _deg",
