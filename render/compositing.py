@@ -214,6 +214,8 @@ def amodal_counts(
 ) -> dict[int, int]:
     """Number of pixel centres that each marker and the hub would cover if nothing but another of them occluded it.
 
+    `render.hidden_features.add_hidden_centers` adds those that another one hides.
+
     A ray along the seam between a feature and the part that surrounds it may hit either. Both lie at one depth;
     then the hit in the whole scene counts, so that an unoccluded feature has as many amodal as visible pixels.
 

@@ -10,15 +10,19 @@ from datasets_manifest.types.frame import FrameSpec
 from geometry.compiled_loops import compiled
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from render.surfaces import Surface, feature_surfaces
+from render.surfaces import Surface
 
 # Features nearer to the eye's plane are not seen whole.
 _NEAREST_M = 1e-3
 
 
-def feature_triangles(fixed: dict[str, Surface]) -> dict[int, Array]:
-    """(F, 3, 3) corners of the triangles of each marker's and the hub's front, by part id, in the stage's axes. [m]"""
-    fronts: dict[str, trimesh.Trimesh] = feature_surfaces(fixed)
+def feature_triangles(fixed: dict[str, Surface], fronts: dict[str, trimesh.Trimesh]) -> dict[int, Array]:
+    """(F, 3, 3) corners of the triangles of each marker's and the hub's front, by part id, in the stage's axes. [m]
+
+    Args:
+        fixed: the drogue's surfaces, by name.
+        fronts: of them, from `feature_surfaces`.
+    """
     return {fixed[name].part_id: np.asarray(mesh.triangles, dtype=np.float64) for name, mesh in fronts.items()}
 
 

@@ -30,24 +30,11 @@ _OPSET = 17
 _DYNAMIC = {0: "batch", 2: "height", 3: "width"}
 
 
-def export_onnx(network: DetectorNetwork, path: Path, metadata: ModelMetadata) -> None:
-    """Write a network in float32, for any number and size of images; the file appears by one rename.
-
-    Args:
-        network: not changed.
-        path: of the file.
-        metadata: stored in the file.
-
-    Raises:
-        OSError: the file cannot be written; the message names it. No partial file is left.
-    """
-    write_onnx(trace_onnx(network), path, metadata)
-
-
 def trace_onnx(network: DetectorNetwork) -> onnx.ModelProto:
-    """The network as ONNX, the images' gain and batch normalisation folded into the convolutions.
+    """The network as ONNX, in float32, for any number and size of images.
 
-    Tracing takes seconds: one trace serves several files that differ in their metadata alone.
+    The images' gain and batch normalisation are folded into the convolutions; the network is not changed. Tracing takes
+    seconds: one trace serves several files that differ in their metadata alone.
     """
     still = copy.deepcopy(network).to("cpu", torch.float32).eval()
     still.fold_gain()

@@ -51,10 +51,11 @@ class Stage:
         key = (frame.drogue, *((name, surface.kind) for name, surface in surfaces.all.items()))
         stage = None
         if key != self._key:
-            stage = _stage_objects(surfaces, moved)
+            fronts = feature_surfaces(surfaces.fixed)
+            stage = _stage_objects(surfaces, fronts, moved)
             corners = [stage.objects[name].vertices_m for name in surfaces.fixed]
             self.drogue_m = np.concatenate(corners) if corners else np.zeros((0, 3), dtype=np.float32)
-            self.triangles_m = feature_triangles(surfaces.fixed)
+            self.triangles_m = feature_triangles(surfaces.fixed, fronts)
             self._key, self._paint = key, {}
         things: dict[str, list[NDArray[np.float32]]] = {}
         for name, surface in surfaces.moved.items():
@@ -84,13 +85,12 @@ class Stage:
         self._key = None
 
 
-def _stage_objects(surfaces: FrameSurfaces, moved: dict[str, MovedMesh]) -> StageObjects:
+def _stage_objects(
+    surfaces: FrameSurfaces, fronts: dict[str, trimesh.Trimesh], moved: dict[str, MovedMesh]
+) -> StageObjects:
     objects = {name: _part_mesh(surface, _placed(surface)) for name, surface in surfaces.fixed.items()}
     objects |= {name: _part_mesh(surface, moved[name]) for name, surface in surfaces.moved.items()}
-    features = {
-        f"alone_{name}": _bare_mesh(surfaces.fixed[name].part_id, mesh)
-        for name, mesh in feature_surfaces(surfaces.fixed).items()
-    }
+    features = {f"alone_{name}": _bare_mesh(surfaces.fixed[name].part_id, mesh) for name, mesh in fronts.items()}
     return StageObjects(objects=objects, features=features)
 
 

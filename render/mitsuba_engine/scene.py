@@ -91,7 +91,7 @@ class DrogueScene:
     def __init__(self, surfaces: FrameSurfaces, keys: dict[str, _Key], shared: dict[_Key, SharedShape]) -> None:
         fronts = feature_surfaces(surfaces.fixed)
         self.features_m = _corners_m(fronts.values())
-        self.triangles_m = feature_triangles(surfaces.fixed)
+        self.triangles_m = feature_triangles(surfaces.fixed, fronts)
         self._drogue_m = _corners_m(surface.painted.mesh for surface in surfaces.fixed.values())
         self.shapes: dict[_Key, SharedShape] = {}
         with scratch_folder() as folder:

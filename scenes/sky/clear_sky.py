@@ -30,8 +30,8 @@ from scenes.sky.sky_models import (
 
 # Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]
 _TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG = 2.0, 9.0
-# Preetham's sky sends up to three times too much light, so its level is another's: between these elevations that of a
-# daylight sky blends into that measured under low suns. [deg]
+# Preetham's sky sends too much light, up to four times under low suns, so its level is another's: between these
+# elevations that of a daylight sky blends into that measured under low suns. [deg]
 _MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG = 4.0, 15.0
 # Below this elevation the sun's light is negligible beside the night sky. [deg]
 _NIGHT_BELOW_DEG = -18.5

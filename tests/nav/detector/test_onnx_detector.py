@@ -18,7 +18,7 @@ from geometry.stereo import EYES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import NetworkConfig
 from nav.detector.onnx_detector import OnnxDetector
-from nav.training.onnx_conversion import INPUT_NAME, OUTPUT_NAMES, export_onnx
+from nav.training.onnx_conversion import INPUT_NAME, OUTPUT_NAMES, trace_onnx, write_onnx
 from tests.support.detector_networks import make_network, write_red_squares
 
 METADATA = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, licence="Apache-2.0")
@@ -214,7 +214,7 @@ def test_exported_network_has_the_outputs_of_torch(tmp_path: Path, config: Netwo
     trained, file = make_network(config), tmp_path / "net" / "network.onnx"
     metadata = replace(METADATA, network=config.to_dict(), manifest_sha256="ab" * 32, training={"passes": 7})
     before = {name: value.clone() for name, value in trained.state_dict().items()}
-    export_onnx(trained.train(), file, metadata)
+    write_onnx(trace_onnx(trained.train()), file, metadata)
     assert trained.training
     assert all(torch.equal(value, before[name]) for name, value in trained.state_dict().items())
     trained.eval()
@@ -234,7 +234,7 @@ def test_exported_network_has_the_outputs_of_torch(tmp_path: Path, config: Netwo
 def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "network.onnx").mkdir()
     with pytest.raises(OSError, match=r"network\.onnx: cannot be written"):
-        export_onnx(make_network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)
+        write_onnx(trace_onnx(make_network(NetworkConfig("s"))), tmp_path / "network.onnx", METADATA)
     assert [path.name for path in tmp_path.iterdir()] == ["network.onnx"]
 
 

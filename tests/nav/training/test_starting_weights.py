@@ -18,7 +18,7 @@ from nav.detector.detector_registry import network_file
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from nav.training.onnx_conversion import export_onnx, import_onnx, recalibrate_batch_norm
+from nav.training.onnx_conversion import import_onnx, recalibrate_batch_norm, trace_onnx, write_onnx
 from nav.training.training_run import check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import read_starting_weights, save_checkpoint
@@ -54,7 +54,7 @@ def maps_of(network: DetectorNetwork, images: torch.Tensor) -> list[torch.Tensor
 
 
 def exported(network: DetectorNetwork, path: Path) -> bytes:
-    export_onnx(network, path, ModelMetadata(network=network.config.to_dict()))
+    write_onnx(trace_onnx(network), path, ModelMetadata(network=network.config.to_dict()))
     return path.read_bytes()
 
 

@@ -22,12 +22,12 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import Part, drogue_part_ids
 from geometry.circles import disc_area_px2, project_disc_centers
-from geometry.se3 import RigidTransform
+from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
-from render.engine import RenderEngine
+from render.engine import RenderEngine, load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
@@ -125,6 +125,19 @@ def test_passes_of_pixel_centres(blender: BlenderEngine) -> None:
         for marker in range(layout.count):
             assert seen.amodal_px[32 + marker] == np.count_nonzero(seen.part_id == 32 + marker)
     assert check_against_passes(label_frame(frame, radiance, expose(frame, radiance)), radiance) == []
+
+
+def test_a_marker_before_the_hub_takes_nothing_of_its_amodal_area(blender: BlenderEngine) -> None:
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,), samples=1)
+    pose = RigidTransform(rotation_from_angles(0.0, 0.85, 0.0), np.array([0.1, 0.05, 3.0]))
+    frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": pose})
+    by_blender = blender.render(frame, recipe.render)
+    by_areas = load_engine("analytic").render(frame, recipe.render)
+    for eye in EYES:
+        found, wanted = (getattr(radiance, eye).amodal_px[Part.HUB] for radiance in (by_blender, by_areas))
+        # Circles of meshes are polygons: a centre or two at the edge. A marker hides a quarter of the hub or more.
+        assert np.count_nonzero(getattr(by_blender, eye).part_id == Part.HUB) < 0.75 * wanted
+        assert abs(found - wanted) <= 2
 
 
 @pytest.mark.slow
