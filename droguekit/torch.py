@@ -268,7 +268,7 @@ class RenderStream(IterableDataset[Any]):
         with (self.cache / EVENTS_FILE).open("a", encoding="utf-8") as events:
             # Two processes may end at the same time: either describes the same frames.
             if try_lock(events):
-                made_by = join_build(self.cache, manifest)[0] if manifest.frames else None
+                made_by, _ = join_build(self.cache, manifest)
                 describe_dataset(self._recipe, self.cache, (), made_by)
 
     def frame_order(self, shard: int, shards: int, start: int = 0) -> Iterator[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import multiprocessing
 import shutil
 from collections import Counter
@@ -18,7 +19,7 @@ from torch.utils.data import DataLoader
 import droguekit
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.storage.layout import MANIFEST_FILE, RECORD_FILE, frame_folder
-from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
 from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset
 from droguekit.batch.merge_shards import merge_shards
@@ -196,6 +197,21 @@ def test_a_cache_is_described_once_all_its_frames_are_there(recipe: Recipe, tmp_
     assert described == [0] * 12 and len(read_manifest(stream.cache).frames) == 12
     written_ns = (stream.cache / MANIFEST_FILE).stat().st_mtime_ns
     assert len(shown(stream)) == 12 and (stream.cache / MANIFEST_FILE).stat().st_mtime_ns == written_ns
+
+
+def test_a_stream_that_another_build_began_names_both(recipe: Recipe, tmp_path: Path) -> None:
+    stream, whole = RenderStream(recipe, tmp_path / "cache"), tmp_path / "whole"
+    for _ in itertools.islice(stream, 6):
+        pass
+    manifest = read_manifest(stream.cache)
+    numpy = manifest.software["numpy"]
+    write_manifest(stream.cache, with_build(manifest, {**manifest.software, "numpy": "9.9"}, manifest.cpu_features))
+    shutil.copytree(stream.cache, whole)
+    shown(stream)
+    droguekit.render_dataset(recipe, whole, workers=0)
+    described = read_manifest(stream.cache)
+    assert set(described.software["numpy"].split(" and ")) == {numpy, "9.9"} and len(described.frames) == 12
+    assert described.software == read_manifest(whole).software
 
 
 def test_ranks_that_start_at_the_same_time_do_not_lock_each_other_out(recipe: Recipe, tmp_path: Path) -> None:
