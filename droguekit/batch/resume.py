@@ -144,14 +144,11 @@ def _refuse_foreign(out: Location, source: RecipeSource) -> None:
     """
     storage = open_storage(out)
     names = [name for name in storage.names("") if not name.startswith(".")]
-    if layout.MANIFEST_FILE in names:
+    if not names or layout.MANIFEST_FILE in names:
         return
     has_pairs = bool(FrameStore(out).staged or shard_numbers(storage))
-    if has_pairs and not _is_of_recipe(out, source):
-        raise ValueError(
-            f"{out}: holds pairs without {layout.MANIFEST_FILE}, not of this recipe, seed and version; give another "
-            "folder"
-        )
+    if has_pairs:
+        _refuse_other_pairs(out, source)
     # Everything else is written after the manifest, so that where no pairs are it is somebody else's.
     left = _OWN_NAMES if has_pairs else {layout.EVENTS_FILE, layout.RECIPE_FILE}
     hold = {name for name in _FRAME_FOLDERS if any(not inside.startswith(".") for inside in storage.names(name))}
@@ -166,20 +163,39 @@ def _is_same_text(storage: Storage, source: RecipeSource) -> bool:
     return storage.exists(layout.RECIPE_FILE) and storage.read(layout.RECIPE_FILE) == source.text.encode()
 
 
-def _is_of_recipe(out: Location, source: RecipeSource) -> bool:
-    """Whether pairs without a manifest are of a recipe: by its text, and by what the first of them shows.
+def _refuse_other_pairs(out: Location, source: RecipeSource) -> None:
+    """Refuse pairs without a manifest of another recipe: by its text, and by the first record that can be read.
 
-    The text alone does not tell of another seed, and is the same for all recipes from Python.
+    The text alone does not tell of another seed, and is the same for all recipes from Python; it decides where no
+    record can be read, since such pairs are of no use.
+
+    Raises:
+        ValueError: they are of another recipe, or the index of a tar file is damaged.
+        OSError: the connection to an object store fails.
     """
-    if not _is_same_text(open_storage(out), source):
-        return False
-    store = FrameStore(out)
-    first = next(iter(store.indices()), None)
-    if first is None:
-        return True
+    store, is_same = FrameStore(out), _is_same_text(open_storage(out), source)
+    damaged: str | None = None
+    for frame_index in store.indices():
+        try:
+            found = PairRecord.model_validate(parse_json(store.read(frame_index, layout.RECORD_FILE)))
+        except ValueError as error:
+            _raise_lost_connection(store, error)
+            damaged = damaged or store.where(frame_index, layout.RECORD_FILE)
+        else:
+            is_same, damaged = is_same and _is_drawn_from(source, frame_index, found), None
+            break
+    if not is_same:
+        unread = "" if damaged is None else f" ({damaged} cannot be read)"
+        raise ValueError(
+            f"{out}: holds pairs without {layout.MANIFEST_FILE}, not of this recipe and seed{unread}; give another "
+            "folder"
+        )
+
+
+def _is_drawn_from(source: RecipeSource, frame_index: int, record: PairRecord) -> bool:
+    found = record.frame
     try:
-        found = PairRecord.model_validate(parse_json(store.read(first, layout.RECORD_FILE))).frame
-        drawn = sample_frame(source.recipe, first)
+        drawn = sample_frame(source.recipe, frame_index)
     except ValueError:
         return False
     is_same = (found.seed, found.scene_id, found.drogue) == (drawn.seed, drawn.scene_id, drawn.drogue)
@@ -338,8 +354,13 @@ def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) 
             if hashlib.sha256(store.read(frame_index, name)).hexdigest() != sha256:
                 return None
     except ValueError as error:
-        cause = error.__cause__
-        if store.storage.is_remote and isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
-            raise cause from None
+        _raise_lost_connection(store, error)
         return None
     return record
+
+
+def _raise_lost_connection(store: FrameStore, error: ValueError) -> None:
+    """Raise the cause of an error of reading where that is no damage of the frame."""
+    cause = error.__cause__
+    if store.storage.is_remote and isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
+        raise cause from None

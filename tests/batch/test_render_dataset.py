@@ -182,9 +182,45 @@ def test_frames_of_another_recipe_stay_where_the_manifest_is_missing(
         (out / layout.RECIPE_FILE).unlink()
     before = file_hashes(out)
     recipe = parse_recipe(text, seed=seed)
-    message = r"holds pairs without manifest\.json, not of this recipe, seed and version; give another folder"
+    message = r"holds pairs without manifest\.json, not of this recipe and seed; give another folder"
     with pytest.raises(ValueError, match=message):
         render_dataset(RecipeSource(recipe, text), out, range(1), 0, PlainProgress(io.StringIO()))
+    assert file_hashes(out) == before
+
+
+def copy_without_manifest(dataset: Path, tmp_path: Path, damaged: range) -> Path:
+    """A copy of a dataset that has lost its manifest and the ends of some records."""
+    out = tmp_path / "copy"
+    shutil.copytree(dataset, out)
+    (out / layout.MANIFEST_FILE).unlink()
+    for index in damaged:
+        record = layout.frame_folder(out, index) / layout.RECORD_FILE
+        record.write_bytes(record.read_bytes()[:100])
+    return out
+
+
+@pytest.mark.parametrize("damaged", [range(1), range(8)])
+def test_pairs_whose_records_are_damaged_are_made_again_where_the_manifest_is_missing(
+    damaged: range, analytic_dataset: Path, tmp_path: Path
+) -> None:
+    out = copy_without_manifest(analytic_dataset, tmp_path, damaged)
+    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).kept == 0
+    assert file_hashes(out) == file_hashes(analytic_dataset)
+
+
+@pytest.mark.parametrize("damaged", [range(1), range(8)])
+def test_damaged_records_of_another_recipe_stay_where_the_manifest_is_missing(
+    damaged: range, analytic_dataset: Path, tmp_path: Path
+) -> None:
+    out = copy_without_manifest(analytic_dataset, tmp_path, damaged)
+    before = file_hashes(out)
+    why = r"not of this recipe and seed" + (r" \(.*record\.json cannot be read\);" if len(damaged) == 8 else ";")
+    with pytest.raises(ValueError, match=why):
+        render_recipe(out, workers=0, text=ANALYTIC_RECIPE.replace('name = "quick"', 'name = "slow"'))
+    if len(damaged) == 1:
+        other_seed = RecipeSource(parse_recipe(ANALYTIC_RECIPE, seed=6), ANALYTIC_RECIPE)
+        with pytest.raises(ValueError, match=why):
+            render_dataset(other_seed, out, range(1), 0, PlainProgress(io.StringIO()))
     assert file_hashes(out) == before
 
 
