@@ -135,7 +135,8 @@ def diff_datasets(a: Location, b: Location, pairs: int = 24, report: ProgressRep
         report: is told of the progress, or None.
 
     Raises:
-        ValueError: no such dataset, or a record or image that cannot be read, or a negative number of pairs.
+        ValueError: no such dataset, a record or image that cannot be read, a changed record, or a negative number
+            of pairs.
     """
     if pairs < 0:
         raise ValueError(f"--pairs: must not be negative, got {pairs}")
@@ -172,7 +173,7 @@ def _read(source: Dataset, report: ProgressReport | None) -> _Read:
     shown.begin("pairs", len(source.frame_indices))
     try:
         for index in source.frame_indices:
-            record = source.record(index)
+            record = source.unchanged_record(index)
             digest = _digest(record.frame.model_dump_json(exclude=_PIPELINE).encode())
             read.drawn[index] = _Drawn(record.scene_id, digest)
             _add_labels(read, record)

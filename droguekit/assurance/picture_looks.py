@@ -149,7 +149,8 @@ def known_looks(dataset: Dataset, report: ProgressReport) -> KnownLooks:
     """The looks of up to 240 left pictures of a dataset, spread over it.
 
     Raises:
-        ValueError: there are no pictures, one or its record cannot be read, or all are of one scene; names the dataset.
+        ValueError: there are no pictures, one or its record cannot be read, the record was changed, or all are of one
+            scene; names the dataset.
     """
     indices = dataset.frame_indices
     if not indices:
@@ -160,7 +161,7 @@ def known_looks(dataset: Dataset, report: ProgressReport) -> KnownLooks:
     report.begin("known pictures", len(chosen))
     try:
         for index in chosen:
-            record = dataset.record(index)
+            record = dataset.unchanged_record(index)
             looks.append(measure_looks(display_picture(dataset.images(index))))
             families.append(record.conditions.family)
             scenes.append(record.scene_id)

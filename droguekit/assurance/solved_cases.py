@@ -47,7 +47,7 @@ def solved_cases(
         report: is told of the progress, or None.
 
     Raises:
-        ValueError: a record or file that cannot be read, or two sources of one name.
+        ValueError: a record or file that cannot be read or was changed, or two sources of one name.
     """
     read = None if estimates is None else read_estimates(estimates)
     methods = {} if read is None else estimates_by_method(read, source.frame_indices, str(estimates))
@@ -64,7 +64,7 @@ def solved_cases(
     shown.begin("pairs", len(source.frame_indices))
     try:
         for index in source.frame_indices:
-            record = source.record(index)
+            record = source.unchanged_record(index)
             see_record(record)
             for name, answers in methods.items():
                 if record.left_from_drogue is not None:

@@ -262,7 +262,7 @@ class _ArrayFile:
 
 
 def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: SizePx) -> _ReadPair:
-    record, stereo = dataset.record(frame_index), dataset.images(frame_index)
+    record, stereo = dataset.unchanged_record(frame_index), dataset.images(frame_index)
     images, cutouts, boxes, others = [], [], [], []
     input_wh = (size_px[1], size_px[0])
     for eye in EYES:

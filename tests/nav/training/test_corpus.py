@@ -17,6 +17,7 @@ from droguekit.batch.progress import PlainProgress
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.corpus import Corpus, open_corpus
+from tests.support.changed_records import with_another_pose
 from tests.support.recipe_builder import RIG_160_PX
 from tests.support.small_datasets import render_toy
 
@@ -104,6 +105,11 @@ def damage_pixels(frame: Path) -> None:
     path.write_bytes(content)
 
 
+def change_pose(frame: Path) -> None:
+    path = frame / "record.json"
+    path.write_bytes(with_another_pose(path.read_bytes()))
+
+
 @pytest.mark.parametrize(
     ("damage", "names"),
     [
@@ -111,9 +117,10 @@ def damage_pixels(frame: Path) -> None:
         (lambda frame: (frame / "left.png").write_bytes(b""), "left.png"),
         (lambda frame: (frame / "left.png").unlink(), "left.png"),
         (lambda frame: (frame / "record.json").write_text("{"), "record.json"),
+        (change_pose, "record.json"),
         (shutil.rmtree, ""),
     ],
-    ids=["corrupt image", "empty image", "missing image", "truncated record", "missing frame"],
+    ids=["corrupt image", "empty image", "missing image", "truncated record", "changed record", "missing frame"],
 )
 def test_a_damaged_pair_is_left_out_and_named_before_training(
     split_dataset: Path, tmp_path: Path, damage: Callable[[Path], None], names: str
