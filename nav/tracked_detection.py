@@ -56,6 +56,10 @@ class TrackedDetector:
         self._misses: dict[Eye, int] = {}
         self._since_detection = 0
 
+    def restart(self) -> None:
+        """Let the detector look at the next pair: one between them was lost."""
+        self._is_following = False
+
     def detect(self, images: StereoImages) -> StereoDetection:
         """Boxes in the next pair."""
         image_kind = _image_kind(images)
@@ -63,7 +67,7 @@ class TrackedDetector:
             self._is_following = False
         self._time_s, self._image_kind = images.time_s, image_kind
         if not self._is_following:
-            return self._restart(images, self._detector.detect(images))
+            return self._start_from(images, self._detector.detect(images))
         followed = self._tracker.follow(images, _NOWHERE)
         lost = [eye for eye in EYES if followed.of(eye) is None]
         self._misses = {eye: self._misses.get(eye, 0) + 1 for eye in lost}
@@ -73,7 +77,7 @@ class TrackedDetector:
         found, self._since_detection = self._detector.detect(images), 0
         both = [eye for eye in EYES if eye not in lost and found.of(eye) is not None]
         if len(lost) == len(EYES) or any(not _both_show_same(followed.of(eye), found.of(eye)) for eye in both):
-            return self._restart(images, found)
+            return self._start_from(images, found)
         new = {eye: found.of(eye) for eye in lost}
         if any(new.values()):
             self._tracker.correct(images, StereoDetection(new.get("left"), new.get("right")))
@@ -91,7 +95,7 @@ class TrackedDetector:
         late_misses = [self._misses[eye] - _FIRST_RETRY for eye in lost]
         return any(each >= 0 and each % _RETRY_EVERY == 0 for each in late_misses)
 
-    def _restart(self, images: StereoImages, found: StereoDetection) -> StereoDetection:
+    def _start_from(self, images: StereoImages, found: StereoDetection) -> StereoDetection:
         """The detector's boxes, from which the tracker starts anew."""
         self._is_following = found != _NOWHERE
         self._misses, self._since_detection = {}, 0

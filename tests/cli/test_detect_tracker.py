@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
+from datasets_manifest.storage.layout import frame_folder, image_file
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.scoring.detection.detection_truth import read_detection_truth
+from droguekit.scoring.detection.detector_runner import DetectorRunner
+from nav.detector.detector import StereoDetection
+from nav.detector.ring_detectors import ColorBlobDetector
+from nav.tracked_detection import TrackedDetector, tracked_detector_factory
 from nav.tracking.tracker import tracker_names
 from tests.support.recipe_builder import recipe_text
 
@@ -70,6 +78,35 @@ def test_without_a_tracker_the_same_images_are_answered(flight: Path, tmp_path: 
     # The detector looks at the first pair of either sequence in both runs.
     starts = (0, 1, FRAMES, FRAMES + 1)  # entries of pairs 0 and 4, two an image pair
     assert [first[index]["bbox"] for index in starts] == [second[index]["bbox"] for index in starts]
+
+
+@pytest.mark.parametrize("stage", ["read", "detect"])
+def test_a_bad_pair_ends_the_sequence(
+    flight: Path, stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, bad, seen = tmp_path / "dataset", 1, list[int]()
+    shutil.copytree(flight, dataset)
+    if stage == "read":
+        (frame_folder(dataset, bad) / image_file("left")).write_bytes(b"")
+    time_s = {round(record.time_s, 6): record.frame_index for record in Dataset(flight).records()}
+    look, follow = ColorBlobDetector.detect, TrackedDetector.detect
+
+    def noted(self: ColorBlobDetector, images: StereoImages) -> StereoDetection:
+        seen.append(time_s[round(images.time_s, 6)])
+        return look(self, images)
+
+    def fails_once(self: TrackedDetector, images: StereoImages) -> StereoDetection:
+        found = follow(self, images)
+        if stage == "detect" and time_s[round(images.time_s, 6)] == bad:
+            raise RuntimeError("half of the pair is done")
+        return found
+
+    monkeypatch.setattr(ColorBlobDetector, "detect", noted)
+    monkeypatch.setattr(TrackedDetector, "detect", fails_once)
+    runner = DetectorRunner(dataset, tracked_detector_factory(ColorBlobDetector, "flow"))
+    list(runner.boxes(0.0, lambda: None))
+    assert runner.faults.count == 1
+    assert seen == [0, bad + 1, FRAMES // 2]
 
 
 def test_help_names_every_tracker(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.results.detection_result import DetectedBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
+from nav.tracked_detection import TrackedDetector
 
 LEAST_SCORE = 0.001
 """Boxes with at least this score are kept: average precision needs low scores too."""
@@ -55,6 +56,7 @@ class DetectorRunner:
         if not self.pairs:
             raise ValueError(f"{dataset}: has no pairs")
         first = detector_of(self._dataset.sought_drogue(self._frame_indices[0]))
+        self._latest = first
         self.name = first.name
         # Only networks name one.
         metadata = getattr(first, "metadata", None)
@@ -76,8 +78,10 @@ class DetectorRunner:
                 pair = self._dataset.pair(index)
             except ValueError as error:
                 self.faults.note(index, unreadable_reason(index, error))
+                self._end_sequence()
             else:
-                yield from self._detect(index, self._detector_of(pair.drogue), pair.images, least_score)
+                self._latest = self._detector_of(pair.drogue)
+                yield from self._detect(index, self._latest, pair.images, least_score)
             advance()
 
     def times(self) -> PairTimes:
@@ -99,6 +103,7 @@ class DetectorRunner:
             found = detector.candidates(images, least_score)
         except Exception as error:
             self.faults.note(index, fault_reason(index, error))
+            self._end_sequence()
             return
         self.wall_s.append(time.perf_counter() - wall_s)
         self.cpu_s.append(time.process_time() - cpu_s)
@@ -107,3 +112,8 @@ class DetectorRunner:
                 box = clipped_box(corner_box(detection.box_xywh_px), images.size_px)
                 if box is not None:
                     yield DetectedBox(image_id_of(index, eye), box, detection.score)
+
+    def _end_sequence(self) -> None:
+        """Let no tracker follow the drogue across a pair without a result."""
+        if isinstance(self._latest, TrackedDetector):
+            self._latest.restart()
