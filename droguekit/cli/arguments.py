@@ -24,13 +24,30 @@ def exit_with_fault(fault: str | None) -> None:
         raise typer.Exit(FAULT)
 
 
-def places(texts: list[str]) -> list[Location]:
+def named_place(param: typer.CallbackParam, text: str | None) -> Location | None:
+    """The callback of an argument or option of type `Place`, which has `parser=str`; None where it is not given.
+
+    Raises:
+        ValueError: an empty text, or a URL that names nothing; names the argument or option.
+    """
+    return None if text is None else _location(param, text)
+
+
+def places(param: typer.CallbackParam, texts: list[str]) -> list[Location]:
     """The callback of an argument of type `list[Place]`, which has `parser=str`.
 
     Raises:
-        ValueError: a URL that names nothing.
+        ValueError: an empty text, or a URL that names nothing.
     """
-    return [as_location(text) for text in texts]
+    return [_location(param, text) for text in texts]
+
+
+def _location(param: typer.CallbackParam, text: str) -> Location:
+    if not text.strip():
+        # An argument goes by the word that the help shows for it.
+        name = param.opts[0] if param.param_type_name == "option" else str(param.metavar).rstrip(".")
+        raise ValueError(f"{name}: must name a folder or a URL, got {text!r}")
+    return as_location(text)
 
 
 RecipeArgument = Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a shipped recipe, or a .toml file.")]
@@ -39,13 +56,13 @@ DatasetArgument = Annotated[
     typer.Argument(
         metavar="DIR",
         parser=str,
-        callback=as_location,
+        callback=named_place,
         help="The dataset's folder, or a URL such as s3://BUCKET/NAME.",
     ),
 ]
 OtherDatasetArgument = Annotated[
     Place,
-    typer.Argument(metavar="OTHER", parser=str, callback=as_location, help="The dataset to compare it with, likewise."),
+    typer.Argument(metavar="OTHER", parser=str, callback=named_place, help="The dataset to compare it with, likewise."),
 ]
 TarOption = Annotated[
     int | None,

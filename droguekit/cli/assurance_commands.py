@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from datasets_manifest.storage.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, Place, exit_with_fault
+from droguekit.cli.arguments import DatasetArgument, OtherDatasetArgument, Place, exit_with_fault, named_place
 from droguekit.cli.main import FAULT
 from droguekit.cli.outputs import output_option
 
@@ -188,7 +187,7 @@ def real_check(
             "--known",
             metavar="DATASET",
             parser=str,
-            callback=lambda text: None if text is None else as_location(text),
+            callback=named_place,
             help="Rendered dataset whose conditions the pictures are compared with.",
         ),
     ] = None,

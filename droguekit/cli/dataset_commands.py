@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from datasets_manifest.storage.storage import as_location
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import human_size, progress_report
 from droguekit.cli.arguments import (
@@ -20,6 +19,7 @@ from droguekit.cli.arguments import (
     SeedOption,
     TarOption,
     WorkersOption,
+    named_place,
     parse_frames,
     parse_shard,
     places,
@@ -178,7 +178,7 @@ def render(
             "--out",
             metavar="DIR",
             parser=str,
-            callback=as_location,
+            callback=named_place,
             help="The dataset's folder, made if missing, or a URL such as s3://BUCKET/NAME.",
         ),
     ],
@@ -233,7 +233,7 @@ def merge(
     out: Annotated[
         Place,
         typer.Argument(
-            metavar="OUT", parser=str, callback=as_location, help="The dataset's folder, made if missing, or a URL."
+            metavar="OUT", parser=str, callback=named_place, help="The dataset's folder, made if missing, or a URL."
         ),
     ],
     shards: Annotated[

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from datasets_manifest.storage.storage import as_location
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import (
     DatasetArgument,
@@ -15,6 +14,7 @@ from droguekit.cli.arguments import (
     Place,
     WorkersOption,
     exit_with_fault,
+    named_place,
 )
 from droguekit.cli.outputs import output_option
 
@@ -203,7 +203,7 @@ DatasetOrNone = Annotated[
     typer.Argument(
         metavar="DIR",
         parser=str,
-        callback=lambda text: None if text is None else as_location(text),
+        callback=named_place,
         help="The dataset's folder, or a URL such as s3://BUCKET/NAME; none with --live.",
     ),
 ]

@@ -252,12 +252,22 @@ def test_estimates_that_are_none(smoke_dataset: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["estimates.jsonl"]
 
 
-@pytest.mark.parametrize("words", [("render", "smoke", "--out", ""), ("merge", "", "a"), ("validate", " ")])
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("render", "smoke", "--out", ""), "--out"),
+        (("merge", "", "a"), "OUT"),
+        (("merge", "a", ""), "SHARD"),
+        (("validate", " "), "DIR"),
+        (("navigate", "", "--out", "poses.jsonl"), "DIR"),
+        (("real-check", "a", "--known", ""), "--known"),
+    ],
+)
 def test_an_empty_place_is_not_the_current_folder(
-    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    _assert_refused(_run(*words), r"place: must be a folder or a URL, got ' ?'")
+    _assert_refused(_run(*words), rf"{name}: must name a folder or a URL, got ' ?'")
     assert list(tmp_path.iterdir()) == []
 
 
