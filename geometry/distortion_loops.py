@@ -8,6 +8,7 @@ from geometry.compiled_loops import compiled, inlined
 from geometry.se3 import Array
 
 _MAX_STEPS = 60
+# 2e-10 px at a focal length of 2000 px.
 _TOLERANCE = 1e-13
 # Near enough for Newton's method to go on without care; closer to the solution rounding moves the error up and down.
 _NEARLY = 1e-9

@@ -362,7 +362,7 @@ def test_a_folder_with_other_things_is_refused_and_untouched(name: str, tmp_path
     message = re.escape(f"holds other files ({name.partition('/')[0]}); give a new or empty folder")
     with pytest.raises(ValueError, match=message):
         render_recipe(out)
-    assert [path for path in out.rglob("*") if path.is_file()] == [out / name]
+    assert {path: path.read_text() for path in out.rglob("*") if path.is_file()} == {out / name: "mine"}
     assert (out / name).read_text() == "mine"
 
 
