@@ -210,7 +210,7 @@ def read_calibration(
         rig, is_given = rig_of_tables(tables, paths, unit_m, size_px)
         return StereoCalibration(rig, "OpenCV's names", is_given)
     if size_px is not None:
-        raise ValueError(f"--image-size: {names[0]} holds the size of its images")
+        raise ValueError(f"{names[0]}: holds the size of its images; do not give one")
     if any(is_camera_chain(table) for table in tables):
         _check_count(paths, 1, "Kalibr's camchain is one file with both cameras")
         return StereoCalibration(rig_of_camera_chain(tables[0], names[0], unit_m), "Kalibr", False)
@@ -227,7 +227,7 @@ def read_calibration(
 
 def _check_count(paths: Sequence[Path], count: int, rule: str) -> None:
     if len(paths) != count:
-        raise ValueError(f"--calibration: {rule}, got {len(paths)} ({', '.join(map(str, paths))})")
+        raise ValueError(f"calibration: {rule}, got {len(paths)} ({', '.join(map(str, paths))})")
 
 
 def _text(path: Path) -> str:

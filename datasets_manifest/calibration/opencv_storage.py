@@ -217,9 +217,12 @@ def _size_px(entries: dict[str, _Entry], given_px: tuple[int, int] | None, place
             sides = entries[key].value
     found_px = image_size(*sides)
     if found_px is None and given_px is None:
-        raise ValueError(f"{place}: lacks image_width or image_height; give --image-size WIDTHxHEIGHT")
-    if None not in (found_px, given_px) and found_px != given_px:
-        raise ValueError(f"--image-size: {place} is for images of {found_px[0]}x{found_px[1]} px")  # type: ignore[index]
+        raise ValueError(
+            f"{place}: lacks image_width or image_height; add them, or give --image-size WIDTHxHEIGHT (width_px and "
+            "height_px of a recipe's rig)"
+        )
+    if found_px is not None and given_px is not None and found_px != given_px:
+        raise ValueError(f"{place}: is for images of {found_px[0]}x{found_px[1]} px, not {given_px[0]}x{given_px[1]}")
     return found_px or given_px  # type: ignore[return-value]
 
 

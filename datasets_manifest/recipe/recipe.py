@@ -27,6 +27,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 from drogue_models.untrusted_files import parse_toml, read_text
+from geometry.distortion import OpenCvDistortion
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
@@ -243,6 +244,12 @@ class Recipe(FrozenModel):
             raise ValueError(
                 f"render.engine: {self.render.engine} draws ideal eyes only, and the rig has real lenses; use "
                 f"{' or '.join(_ENGINES_WITH_LENSES)}, or a rig without lenses"
+            )
+        has_long_models = any(isinstance(lens.distortion, OpenCvDistortion) for lens in self.rig.lenses or ())
+        if has_long_models and self.render.engine == "blender":
+            raise ValueError(
+                "render.engine: blender draws lenses with k1, k2, p1, p2 and k3, and the rig's have more coefficients; "
+                "use mitsuba or analytic"
             )
         return self
 

@@ -6,12 +6,14 @@ ideal or real lenses.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
+from datasets_manifest.calibration.baseline_units import BASELINE_UNITS_M
 from datasets_manifest.random_streams import seeded_generator
 from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import Optics, Sensor
@@ -86,6 +88,8 @@ class Eyes(FrozenModel):
         return self
 
 
+_CALIBRATION_SUFFIXES = (".yaml", ".yml", ".xml", ".json")
+
 # A good 8 mm lens of a machine vision camera, and a mount adjusted by hand (our assumption).
 _REAL_EYES = Eyes(
     k1=Range(low=-0.08, high=-0.04),
@@ -99,7 +103,11 @@ _REAL_EYES = Eyes(
 
 
 class _RigTable(FrozenModel):
-    """The table of a shipped rig with changes."""
+    """The table of a shipped rig with changes.
+
+    A calibration sets what it measured: focal lengths, baseline and lenses; the image's size only where its files hold
+    one.
+    """
 
     preset: str
     width_px: int | None = Field(default=None, ge=16, le=16384)
@@ -112,6 +120,48 @@ class _RigTable(FrozenModel):
     noise_free: bool | None = None
     optics: Optics | None = None
     eyes: Eyes | None = None
+    calibration: tuple[str, ...] | None = None
+    calibration_unit: Literal["m", "cm", "mm"] | None = None
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _files(cls, value: object) -> object:
+        files = _calibration_files(value)
+        if not isinstance(files, list) or len(files) not in (1, 2):
+            raise ValueError(f"must be one file, or two that belong together, got {value}")
+        return files
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.calibration is None:
+            if self.calibration_unit is not None:
+                raise ValueError("calibration_unit: is of a calibration; name its file as `calibration`")
+            return self
+        given = [key for key in ("focal_px", "baseline_m", "eyes") if getattr(self, key) is not None]
+        if given:
+            raise ValueError(f"{', '.join(given)}: the calibration sets it; leave it out")
+        if (self.width_px is None) != (self.height_px is None):
+            raise ValueError("width_px, height_px: give both, or none where the calibration holds them")
+        return self
+
+    def calibrated_rig(self, rig: StereoRig) -> StereoRig:
+        """The rig with the cameras of the calibration.
+
+        Raises:
+            ValueError: the files are no calibration.
+        """
+        # Loads OpenCV and the YAML reader, which other rigs do without.
+        from datasets_manifest.calibration.calibration_reader import read_calibration
+
+        size_px = None if self.width_px is None or self.height_px is None else (self.width_px, self.height_px)
+        paths = [Path(file) for file in self.calibration or ()]
+        measured = read_calibration(paths, BASELINE_UNITS_M[self.calibration_unit or "m"], size_px).rig
+        return replace(rig, camera=measured.camera, baseline_m=measured.baseline_m, lenses=measured.lenses)
+
+
+def _calibration_files(value: object) -> object:
+    """The files of a `calibration`, which may be one name; anything else as it is."""
+    return [value] if isinstance(value, str) else value
 
 
 def read_rig_file(text: str, where: str) -> dict[str, Any]:
@@ -136,23 +186,39 @@ def read_rig_file(text: str, where: str) -> dict[str, Any]:
 def load_rig(value: object, base: Path | None = None) -> object:
     """A rig's name or table as it is, and the table of a `.toml` file that it names.
 
+    Files of a calibration are then named as seen from the current folder.
+
     Args:
         value: of the recipe.
-        base: folder that a relative path starts from.
+        base: folder that relative paths start from; those of a rig's file start from its own folder.
 
     Raises:
         ValueError: the file cannot be read.
     """
+    folder = base or Path()
+    if isinstance(value, dict):
+        return _with_calibration_paths(value, folder)
     if not (isinstance(value, str) and value.endswith(".toml")):
+        if isinstance(value, str) and value.endswith(_CALIBRATION_SUFFIXES):
+            raise ValueError(
+                f'rig: {value}: write a calibration as `[rig]`, `preset = "mono"`, `calibration = "{value}"`'
+            )
         return value
-    path = (base or Path()) / value
+    path = folder / value
     try:
         text = read_text(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from error
-    return read_rig_file(text, str(path))
+    return _with_calibration_paths(read_rig_file(text, str(path)), path.parent)
+
+
+def _with_calibration_paths(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    files = _calibration_files(table.get("calibration"))
+    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        return table
+    return {**table, "calibration": [str(folder / file) for file in files]}
 
 
 def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
@@ -188,9 +254,11 @@ def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
         }
         sensor = Sensor.model_validate({**sensor.model_dump(), **changes})
         tip_m = rig.probe_tip_body_m if table.probe_tip_body_m is None else np.array(table.probe_tip_body_m)
+        rig = replace(rig, camera=camera, baseline_m=table.baseline_m or rig.baseline_m, probe_tip_body_m=tip_m)
+        if table.calibration is not None:
+            return table.calibrated_rig(rig), sensor
         eyes = table.eyes or (_REAL_EYES if table.preset == "paper-real" else None)
-        lenses = None if eyes is None else _draw_lenses(eyes, camera, seed)
-        return StereoRig(camera, table.baseline_m or rig.baseline_m, rig.body_from_left, tip_m, lenses), sensor
+        return rig if eyes is None else replace(rig, lenses=_draw_lenses(eyes, camera, seed)), sensor
     except ValidationError as error:
         raise ValueError(f"rig: {explain(error)}") from error
     except ValueError as error:

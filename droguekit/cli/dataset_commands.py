@@ -34,6 +34,7 @@ EXAMPLES = {
     "new": (
         "droguekit new drogue --out basket.toml --markers 12 --marker-radius 0.01 --luminance 20000",
         "droguekit new rig --out acme-rig.toml --size 1920x1200 --focal-px 1739 --baseline 0.25 --bits 12",
+        "droguekit new rig --out acme-rig.toml --calibration stereo.yaml   (your own cameras, as calibrated)",
         "droguekit new recipe --out acme.toml --drogue basket.toml --rig acme-rig.toml --distance 5:60",
     ),
     "plan": (
@@ -66,7 +67,7 @@ EXAMPLES = {
 # The options of `new` that only one kind has.
 _OF_KIND = {
     "drogue": ("rim_radius", "markers", "marker_radius", "luminance"),
-    "rig": ("preset", "size", "focal_px", "baseline", "bits"),
+    "rig": ("preset", "size", "focal_px", "baseline", "calibration", "calibration_unit", "bits"),
     "recipe": ("drogue", "rig", "distance", "pairs"),
 }
 
@@ -83,10 +84,21 @@ def new(
     ] = 0.0,
     preset: Annotated[str, typer.Option("--preset", help="Rig: the shipped one to start from.")] = "mono",
     size: Annotated[
-        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Rig: of an image in pixels.")
-    ] = "1280x960",
+        str | None,
+        typer.Option("--size", metavar="WIDTHxHEIGHT", help="Rig: of an image in pixels; 1280x960 by default."),
+    ] = None,
     focal_px: Annotated[float, typer.Option("--focal-px", help="Rig: focal length over pixel pitch.")] = 2133.3,
     baseline: Annotated[float, typer.Option("--baseline", metavar="M", help="Rig: distance of the cameras.")] = 0.12,
+    calibration: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--calibration",
+            metavar="FILE",
+            help="Rig: stereo calibration of OpenCV, Kalibr, ROS, EuRoC or ORB-SLAM instead of focal length and "
+            "baseline; given twice for two files. --size is then for files that lack it.",
+        ),
+    ] = None,
+    calibration_unit: Annotated[str, typer.Option(metavar="m|cm|mm", help="Rig: of the calibration's baseline.")] = "m",
     bits: Annotated[int, typer.Option("--bits", help="Rig: of an image, 8 or 12.")] = 8,
     drogue: Annotated[str, typer.Option("--drogue", help="Recipe: a shipped drogue or a .toml file.")] = "red-8",
     rig: Annotated[str, typer.Option("--rig", help="Recipe: a shipped rig or a .toml file.")] = "mono",
@@ -106,6 +118,11 @@ def new(
             source = context.get_parameter_source(name)
             if other != kind and source is not None and source.name != "DEFAULT":
                 raise ValueError(f"--{name.replace('_', '-')}: is of a {other}, and this is a {kind}; leave it out")
+    for name in ("focal_px", "baseline") if calibration else ("calibration_unit",):
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            reason = "the calibration has it; leave it out" if calibration else "is of --calibration, which is missing"
+            raise ValueError(f"--{name.replace('_', '-')}: {reason}")
     choices = FileChoices(
         rim_radius_m=rim_radius,
         markers=markers,
@@ -115,6 +132,8 @@ def new(
         size=size,
         focal_px=focal_px,
         baseline_m=baseline,
+        calibration=tuple(calibration or ()),
+        calibration_unit=calibration_unit,
         bits=bits,
         drogue=drogue,
         rig=rig,

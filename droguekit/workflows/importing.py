@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
+from datasets_manifest.calibration.baseline_units import BASELINE_UNITS_M
+
 if TYPE_CHECKING:
     from datasets_manifest.calibration.calibration_reader import StereoCalibration
     from datasets_manifest.importers.imported_dataset import ImportedPairs
@@ -17,7 +19,6 @@ _ROS2_SUFFIXES = {".mcap", ".db3"}
 # The key of all that rosbag2 writes into metadata.yaml, which begins with it.
 _METADATA_KEY, _METADATA_BEGIN_BYTES = b"rosbag2_bagfile_information", 2**16
 _IMAGE_SIZE = re.compile("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
-_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,10 @@ class ImportOptions:
         """
         if self.encoding not in (None, "linear", "gamma"):
             raise ValueError(f"--encoding: must be linear or gamma, got {self.encoding!r}")
-        if self.calibration_unit not in _UNITS_M:
-            raise ValueError(f"--calibration-unit: must be one of {', '.join(_UNITS_M)}, got {self.calibration_unit!r}")
+        if self.calibration_unit not in BASELINE_UNITS_M:
+            raise ValueError(
+                f"--calibration-unit: must be one of {', '.join(BASELINE_UNITS_M)}, got {self.calibration_unit!r}"
+            )
         if self.image_size is not None and _IMAGE_SIZE.fullmatch(self.image_size) is None:
             raise ValueError(f"--image-size: must be WIDTHxHEIGHT such as 1280x960, got {self.image_size!r}")
         if self.image_size is not None and not self.calibration:
@@ -182,7 +185,7 @@ def _open_bag(path: Path, options: ImportOptions) -> tuple[ImportedPairs, Stereo
     bag = RosBag(path, options.pair_of("topics"), options.stamp_tolerance_ns)
     given = _given_calibration(options)
     if given is None:
-        rig = bag.rig(options.pair_of("camera_info"), _UNITS_M[options.calibration_unit])
+        rig = bag.rig(options.pair_of("camera_info"), BASELINE_UNITS_M[options.calibration_unit])
         given = StereoCalibration(rig, "CameraInfo of the bag", is_rectification_given=True)
     return bag, given
 
@@ -192,7 +195,7 @@ def _given_calibration(options: ImportOptions) -> StereoCalibration | None:
 
     if not options.calibration:
         return None
-    return read_calibration(options.calibration, _UNITS_M[options.calibration_unit], options.image_size_px)
+    return read_calibration(options.calibration, BASELINE_UNITS_M[options.calibration_unit], options.image_size_px)
 
 
 def _bag_path(source: Path) -> Path | None:

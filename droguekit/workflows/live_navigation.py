@@ -14,9 +14,10 @@ from time import monotonic
 from types import FrameType
 from typing import TYPE_CHECKING, Literal, cast
 
+from datasets_manifest.calibration.baseline_units import BASELINE_UNITS_M
 from datasets_manifest.storage.pair_faults import PairFaults
 from droguekit.workflows.estimate_file import EstimateFile
-from droguekit.workflows.importing import _UNITS_M, ImportOptions
+from droguekit.workflows.importing import ImportOptions
 from droguekit.workflows.navigation import (
     FixCount,
     LatencyTally,
@@ -192,7 +193,7 @@ def _camera(
 
     images = live.images()
     assert live.source is not None
-    calibration = read_calibration(images.calibration, _UNITS_M[images.calibration_unit], images.image_size_px)
+    calibration = read_calibration(images.calibration, BASELINE_UNITS_M[images.calibration_unit], images.image_size_px)
     rig = calibration.rig
     encoding = cast(Literal["linear", "gamma"] | None, images.encoding)
     settings = CameraSettings(rig, load_drogue(images.drogue), encoding, images.black_level_dn or 0.0, images.bits)

@@ -12,11 +12,12 @@ from pydantic import ValidationError
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.recipe.rigs import read_rig_file, resolve_rig
+from datasets_manifest.recipe.rigs import load_rig, read_rig_file, resolve_rig
 from drogue_models.presets import explain, parse_drogue
 
 # The face is as wide as leaves a margin of these many marker radii on either side of the markers.
 _FACE_MARGIN, _TUBE_SHARE = 2.5, 0.016
+_USUAL_SIZE = "1280x960"
 
 _DROGUE = """# A drogue. Use it as `drogue = "{file}"` in a recipe, and look at it with
 # `droguekit model {file} --out drogue.glb`.
@@ -48,11 +49,7 @@ _RIG = """# A stereo rig. Use it as `rig = "{file}"` in a recipe.
 # The shipped rig to start from: its sensor's noise, responsivity and colour. docs/reference/conventions.md lists them.
 preset = {preset}
 
-# Size of an image, focal length over pixel pitch, and distance of the cameras.
-width_px = {width}
-height_px = {height}
-focal_px = {focal:.15g}
-baseline_m = {baseline:.15g}
+{geometry}
 
 # 8, or 12 in files of 16 bits, which most viewers show as black; `droguekit preview` shows them.
 output_bits = {bits}
@@ -61,6 +58,21 @@ output_bits = {bits}
 [optics]
 {optics}
 
+{eyes}"""
+_CALIBRATION = """# Cameras, lenses and baseline are those of this file of OpenCV, Kalibr, ROS, EuRoC or ORB-SLAM.
+# Two files that belong together are ["left.yaml", "right.yaml"]. docs/how-to/calibrate.md tells more.
+calibration = {files}
+calibration_unit = {unit}"""
+_SIZE = """# Size of an image.
+width_px = {width}
+height_px = {height}
+"""
+_GEOMETRY = """# Size of an image, focal length over pixel pitch, and distance of the cameras.
+width_px = {width}
+height_px = {height}
+focal_px = {focal:.15g}
+baseline_m = {baseline:.15g}"""
+_EYES = """
 # Real lenses: Brown-Conrady coefficients. Without this table the lenses are {lenses}.
 # [eyes]
 # k1 = -0.12
@@ -102,6 +114,8 @@ class FileChoices:
     Attributes:
         rim_radius_m, markers, marker_radius_m, luminance_cd_m2: of a drogue.
         preset, size, focal_px, baseline_m, bits: of a rig.
+        calibration, calibration_unit: of a rig instead of focal length and baseline; its one or two files. The size is
+            then only for files that lack it.
         drogue, rig, distance, pairs: of a recipe.
     """
 
@@ -110,10 +124,12 @@ class FileChoices:
     marker_radius_m: float = 0.01
     luminance_cd_m2: float = 0.0
     preset: str = "mono"
-    size: str = "1280x960"
+    size: str | None = None
     focal_px: float = 2133.3
     baseline_m: float = 0.12
     bits: int = 8
+    calibration: tuple[Path, ...] = ()
+    calibration_unit: str = "m"
     drogue: str = "red-8"
     rig: str = "mono"
     distance: str = "5:40"
@@ -137,11 +153,12 @@ def write_new_file(kind: Literal["drogue", "rig", "recipe"], out: Path, choices:
             parse_drogue(text, out.parent)
         except ValidationError as error:
             raise ValueError(f"new drogue: {explain(error)}") from error
-    elif kind == "rig":
-        resolve_rig(read_rig_file(text, str(out)))
     else:
         out.parent.mkdir(parents=True, exist_ok=True)  # files are named as seen from there
-        parse_recipe(text, out.parent)
+        if kind == "rig":
+            resolve_rig(load_rig(read_rig_file(text, str(out)), out.parent))
+        else:
+            parse_recipe(text, out.parent)
     write_text_atomic(out, text)
 
 
@@ -178,22 +195,39 @@ def _drogue_text(out: Path, choices: FileChoices) -> str:
 
 
 def _rig_text(out: Path, choices: FileChoices) -> str:
-    width, _, height = choices.size.partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise ValueError(f"--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {choices.size!r}")
     rig, sensor = resolve_rig(choices.preset)
     optics = sensor.optics.model_dump(exclude_defaults=True) | {"pixel_pitch_um": sensor.optics.pixel_pitch_um}
+    lenses = "ideal" if rig.lenses is None else "those of the preset"
     return _RIG.format(
         file=out.name,
         preset=_text(choices.preset),
-        width=int(width),
-        height=int(height),
-        focal=choices.focal_px,
-        baseline=choices.baseline_m,
+        geometry=_calibration_text(out, choices) if choices.calibration else _geometry_text(choices),
         bits=choices.bits,
         optics="\n".join(f"{key} = {json.dumps(value)}" for key, value in optics.items()),
-        lenses="ideal" if rig.lenses is None else "those of the preset",
+        eyes="" if choices.calibration else _EYES.format(lenses=lenses),
     )
+
+
+def _size_px(size: str) -> tuple[int, int]:
+    width, _, height = size.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {size!r}")
+    return int(width), int(height)
+
+
+def _geometry_text(choices: FileChoices) -> str:
+    width_px, height_px = _size_px(choices.size or _USUAL_SIZE)
+    return _GEOMETRY.format(width=width_px, height=height_px, focal=choices.focal_px, baseline=choices.baseline_m)
+
+
+def _calibration_text(out: Path, choices: FileChoices) -> str:
+    files = [str(file) if file.is_absolute() else os.path.relpath(file, out.parent) for file in choices.calibration]
+    named = json.dumps(files if len(files) > 1 else files[0], ensure_ascii=False)
+    text = _CALIBRATION.format(files=named, unit=_text(choices.calibration_unit))
+    if choices.size is None:
+        return text
+    width_px, height_px = _size_px(choices.size)
+    return f"{_SIZE.format(width=width_px, height=height_px)}\n{text}"
 
 
 def _recipe_text(out: Path, choices: FileChoices) -> str:

@@ -178,7 +178,7 @@ def test_an_image_size_is_given_where_the_files_lack_it(
     path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith("image_")))
     camera = Dataset(smoke_dataset).manifest.recipe.rig.camera
     assert run(order(flight, tmp_path / "a", path)) == WRONG_INPUT
-    assert "stereo.yaml: lacks image_width or image_height; give --image-size" in capfd.readouterr().err
+    assert "stereo.yaml: lacks image_width or image_height; add them, or give --image-size" in capfd.readouterr().err
     size = f"{camera.width_px}x{camera.height_px}"
     assert run([*order(flight, tmp_path / "a", path), "--image-size", size]) == DONE
     for wrong in ("1280", "1280*960", "0x960", "big"):

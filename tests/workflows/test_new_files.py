@@ -10,6 +10,7 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.recipe.rigs import SENSORS, load_rig, resolve_rig
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from tests.support.stereo_calibrations import EVERYTHING, INTRINSICS, POSE, R1, check_rig, storage
 
 
 def test_a_recipe_of_a_new_drogue_and_a_new_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,6 +93,43 @@ def test_numbers_and_names_come_back_as_they_were_given(tmp_path: Path, monkeypa
     assert run(["new", "recipe", "--rig", "my rig.toml", "--out", "below/Größe.toml"]) == DONE
     read = load_recipe("below/Größe.toml").recipe
     assert (read.rig.camera.width_px, read.rig.camera.fx_px, read.name) == (640, 1745.678912, "gr--e")
+
+
+def test_a_new_rig_of_a_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    storage(Path("stereo.yaml"), EVERYTHING)
+    assert run(["new", "rig", "--calibration", "stereo.yaml", "--out", "below/rig.toml"]) == DONE
+    assert run(["new", "recipe", "--rig", "below/rig.toml", "--out", "mine.toml"]) == DONE
+    check_rig(load_recipe("mine.toml").recipe.rig, R1)
+    # OpenCV's samples write the size of the images nowhere.
+    storage(Path("intrinsics.yml"), INTRINSICS)
+    storage(Path("extrinsics.yml"), POSE)
+    files = ["--calibration", "intrinsics.yml", "--calibration", "extrinsics.yml"]
+    assert run(["new", "rig", *files, "--size", "1280x960", "--out", "two.toml"]) == DONE
+    check_rig(resolve_rig(load_rig("two.toml"))[0], R1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--calibration", "stereo.yaml", "--focal-px", "2000"], "--focal-px: the calibration has it; leave it out"),
+        (["--calibration", "stereo.yaml", "--baseline", "0.2"], "--baseline: the calibration has it; leave it out"),
+        (["--calibration-unit", "mm"], "--calibration-unit: is of --calibration, which is missing"),
+        (["--calibration", "nowhere.yaml"], "nowhere.yaml: there is no such calibration file"),
+    ],
+)
+def test_options_beside_a_calibration_are_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    storage(Path("stereo.yaml"), EVERYTHING)
+    assert run(["new", "rig", *options, "--out", "rig.toml"]) == WRONG_INPUT
+    assert message in capsys.readouterr().err
+    assert not Path("rig.toml").exists()
 
 
 @pytest.mark.parametrize("drogue", ['red-8"\nseed = 5\n#', 'a"b', "a\\b"])
