@@ -177,7 +177,8 @@ def mine_recipe(
     laws = tuple(_change_laws(table, old, records, cases, choices))
     if not laws:
         raise ValueError(
-            f"{source.path}: recipe: has one drogue, one family and one distance; there is no law to weight"
+            f"{source.path}: recipe: has one drogue, no families, and stations or one place for its distance; "
+            "there is no law to weight"
         )
     table["name"] = out.stem
     move_file_names(table, choices.recipe.parent if choices.recipe else Path(), out.parent)

@@ -12,18 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import droguekit
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe, load_recipe
 from datasets_manifest.recipe.rigs import _RigTable
 from datasets_manifest.recipe.sequence_ranges import MOST_SEQUENCE_S
-from datasets_manifest.types.estimates import read_estimates
+from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import MAX_MARKERS
 from drogue_models.presets import PRESETS, load_drogue
 from droguekit.cli.main import COMMANDS, DONE, FAULT, INTERRUPTED, WRONG_INPUT, load_command
 from droguekit.workflows.rendering import MOST_TIMEOUT_S
-from geometry.se3 import RigidTransform
+from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig
 from nav.pair_navigator import BINARY_METHODS, RIM_METHODS
 from nav.pose.method_registry import ENTRY_POINT_GROUP, METHODS
@@ -137,6 +138,29 @@ def test_the_example_of_a_method_finds_a_pose() -> None:
     assert isinstance(answer, Solution)
     # Centres of facing discs are those of their images; pixels of 1e3 in float64.
     np.testing.assert_allclose(answer.left_from_drogue.translation_m, [0.06, 0.0, 5.0], atol=1e-9)
+
+
+def test_the_table_of_poses_holds_those_of_the_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (example,) = code_blocks(REPOSITORY / "docs/how-to/compare-poses.md", "python")
+    monkeypatch.chdir(tmp_path)
+    pose = RigidTransform(rotation_from_angles(0.1, -0.2, 0.3), np.array([0.06, -0.1, 5.0]))
+    fix = PoseEstimate(
+        frame_index=1, method="joint-hub", left_from_drogue=pose, covariance=np.diag([1.0, 4.0, 9.0, 0, 0, 0]) * 1e-6
+    )
+    others = NoFix(frame_index=0, method="joint-hub", reason="dark"), fix.model_copy(update={"method": "paper"})
+    stamped = fix.model_copy(update={"frame_index": 2, "time_s": 12.25})
+    write_estimates(Path("estimates.jsonl"), (*others, fix, stamped))
+    record = Path("data/flight7/frames/000001/record.json")
+    record.parent.mkdir(parents=True)
+    record.write_text('{"time_s": 0.04}')
+    exec(compile(example, "compare-poses.md", "exec", dont_inherit=True), {})
+    table = np.genfromtxt("poses.csv", delimiter=",", names=True)
+    assert table["time_s"].tolist() == [0.04, 12.25]
+    for row in table:
+        read = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+        np.testing.assert_allclose(read, pose.rotation, atol=1e-12)
+        np.testing.assert_allclose([row[f"{axis}_m"] for axis in "xyz"], pose.translation_m, atol=1e-12)
+        np.testing.assert_allclose([row[f"sigma_{axis}_m"] for axis in "xyz"], [1e-3, 2e-3, 3e-3], rtol=1e-12)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
