@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from datasets_manifest.storage.layout import CALIBRATION_FOLDER
-from datasets_manifest.storage.storage import Location, join, open_storage
 from geometry.distortion import Lens
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
@@ -29,21 +27,6 @@ def calibration_files(rig: StereoRig) -> dict[str, str]:
     if kalibr_fault(rig) is None:
         files[KALIBR_FILE] = kalibr_camchain(rig)
     return files | {camera_info_file(eye): camera_info(rig, eye) for eye in EYES}
-
-
-def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
-    """Write all calibration files into the dataset's calibration folder.
-
-    Returns:
-        Locations of the files, OpenCV's first.
-
-    Raises:
-        OSError: they cannot be written.
-    """
-    storage, files = open_storage(dataset), calibration_files(rig)
-    for name, text in files.items():
-        storage.write(f"{CALIBRATION_FOLDER}/{name}", text.encode())
-    return [join(dataset, f"{CALIBRATION_FOLDER}/{name}") for name in files]
 
 
 def opencv_stereo(rig: StereoRig) -> str:

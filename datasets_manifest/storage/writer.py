@@ -1,4 +1,4 @@
-"""Writes stereo pairs into a dataset; a frame appears whole or not at all."""
+"""Writes stereo pairs and calibrations into a dataset; a frame appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.calibration.calibration_files import calibration_files
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.layout import (
+    CALIBRATION_FOLDER,
     FRAMES_FOLDER,
     RECORD_FILE,
     frame_name,
@@ -20,10 +22,10 @@ from datasets_manifest.storage.layout import (
     mosaic_file,
     parts_file,
 )
-from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.storage import Location, join, open_storage
 from datasets_manifest.types.images import Pixels, StereoImages
 from datasets_manifest.types.records import PairRecord
-from geometry.stereo import Eye
+from geometry.stereo import Eye, StereoRig
 
 
 def encode_files(images: StereoImages, part_ids: Mapping[Eye, NDArray[np.uint8]]) -> dict[str, bytes]:
@@ -125,3 +127,18 @@ def remove_leftovers(dataset: Location) -> list[str]:
     for name in found:
         storage.delete(name)
     return [storage.where(name) for name in found]
+
+
+def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
+    """Write all calibration files into the dataset's calibration folder.
+
+    Returns:
+        Locations of the files, OpenCV's first.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    storage, files = open_storage(dataset), calibration_files(rig)
+    for name, text in files.items():
+        storage.write(f"{CALIBRATION_FOLDER}/{name}", text.encode())
+    return [join(dataset, f"{CALIBRATION_FOLDER}/{name}") for name in files]

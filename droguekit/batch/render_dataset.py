@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any, NamedTuple, TextIO
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.release.card import write_card, write_croissant
 from datasets_manifest.storage.frame_store import list_frames
@@ -19,6 +18,7 @@ from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECIPE_FILE
 from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, read_manifest, with_build, write_manifest
 from datasets_manifest.storage.packing import read_packing
 from datasets_manifest.storage.storage import Location, join, open_storage
+from datasets_manifest.storage.writer import write_calibration
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
 from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
 from droguekit.batch.frame_task import FATAL_ERRORS, FIRST_FRAMES, FrameReport, FrameTask, error_reason

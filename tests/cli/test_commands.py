@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.writer import write_calibration
 from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from nav.runner import method_names

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import write_calibration
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import StereoRig

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.recipe.rigs import resolve_rig
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import write_calibration
 from geometry.stereo import EYES
 from tests.support.recipe_builder import RecipeTable, Section, build_recipe, recipe_text, stations
 from tests.support.small_datasets import rendered

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices, write_calibration
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.rigs import resolve_rig
+from datasets_manifest.storage.writer import write_calibration
 from datasets_manifest.types.field_types import Rig, write_rig
 from geometry.distortion import BrownConrady, Lens, OpenCvDistortion
 from geometry.stereo import EYES, StereoRig

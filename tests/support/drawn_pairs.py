@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
-from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.storage.writer import encode_files, write_calibration, write_frame
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord

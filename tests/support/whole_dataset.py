@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
-from datasets_manifest.storage.writer import write_frame
+from datasets_manifest.storage.writer import write_calibration, write_frame
 from droguekit.batch.frame_task import make_frame
 from labelgen.export.annotations.coco import write_annotations
 from render.engine import load_engine

@@ -15,10 +15,10 @@ from datasets_manifest.calibration.calibration_files import (
     camera_info,
     kalibr_camchain,
     opencv_stereo_matrices,
-    write_calibration,
     yaml_number,
 )
 from datasets_manifest.recipe.rigs import resolve_rig
+from datasets_manifest.storage.writer import write_calibration
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, StereoRig, paper_rig
 from tests.support.stereo_calibrations import opencv_ideal_px
