@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import PART_SUFFIX, new_folder, try_lock
 from datasets_manifest.storage.manifest import SplitName
-from datasets_manifest.storage.pair_faults import PairFaults
+from datasets_manifest.storage.pair_faults import PairFaults, read_or_note
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.images import StereoImages
@@ -85,7 +85,7 @@ class ImageCache:
     Attributes:
         images: (P, 2, H, W, 3) left and right, gamma-encoded red, green, blue; memory-mapped.
         pairs: the labels of P pairs.
-        faults: of the other pairs, which are damaged.
+        faults: of the other pairs, which are damaged, and of pairs that can no longer be read as they were taken.
         opacities: (n,) of all cut-outs, one after the other, row by row, 0 to 255; memory-mapped.
     """
 
@@ -285,15 +285,16 @@ def _in_input(placement: Letterbox, box: PixelBox) -> PixelBox:
 
 @dataclass(frozen=True)
 class DatasetStamp:
-    """What identifies a dataset, and how many of its pairs can be read.
+    """What identifies a dataset, and how many of its pairs a network is trained on.
 
-    Photographs have no manifest, and an empty hash of it.
+    A training can be resumed where other pairs were damaged meanwhile. Photographs have no manifest, and an empty hash
+    of it.
     """
 
     name: str
     dataset_sha256: str
     manifest_sha256: str
-    pairs: int
+    train_pairs: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +306,6 @@ class Corpus:
         size_px: (height, width) of the images.
         caches: one for each dataset.
         places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
-        fault: damaged pairs, which are left out, as one line; None for nothing.
         without_drogue: photographs to train on beside the pairs, the same for both eyes, or None.
         sources: the datasets themselves, for images as they were taken.
     """
@@ -314,9 +314,14 @@ class Corpus:
     size_px: SizePx
     caches: tuple[ImageCache, ...]
     places: NDArray[np.int64]
-    fault: str | None = None
     without_drogue: Photographs | None = None
     sources: tuple[Dataset, ...] = ()
+
+    @property
+    def fault(self) -> str | None:
+        """Damaged pairs so far, which are left out, as one line; None for nothing."""
+        lines = ((source.path, cache.faults.line()) for source, cache in zip(self.sources, self.caches, strict=True))
+        return next((f"{path}: {line}" for path, line in lines if line is not None), None)
 
     @property
     def photographs(self) -> NDArray[np.int64]:
@@ -348,15 +353,12 @@ class Corpus:
         image: Image = self.caches[dataset].images[index, eye]
         return image
 
-    def stereo_images(self, pair: int) -> StereoImages:
-        """Both images of a pair as they were taken, read from its dataset.
-
-        Raises:
-            ValueError: they can no longer be read; the message names the file.
-        """
+    def stereo_images(self, pair: int) -> StereoImages | None:
+        """Both images of a pair as they were taken, from its dataset; None, and a fault, if they are damaged by now."""
         dataset, _ = self.places[pair]
         source: Dataset = self.sources[dataset]
-        return source.images(self.entry(pair).frame_index)
+        cache: ImageCache = self.caches[dataset]
+        return read_or_note(self.entry(pair).frame_index, source.images, cache.faults)
 
     def opacity(self, pair: int, eye: EyeIndex) -> tuple[Cutout, Alpha]:
         """Where the drogue of one eye is cut out, and its (h, w) opacities, 0 to 255; only of `pairs_to_cut`."""
@@ -405,7 +407,6 @@ def open_corpus(
     datasets = _open_datasets(paths)
     without = None if photographs is None else read_photographs(photographs, size_px)
     caches: list[ImageCache] = []
-    fault: str | None = None
     for dataset in datasets:
         observer.begin(f"images of {dataset.path} at {size_text(size_px)}", len(dataset.frame_indices))
         try:
@@ -413,19 +414,23 @@ def open_corpus(
         finally:
             observer.end()
         if (line := caches[-1].faults.line()) is not None:
-            fault = fault or f"{dataset.path}: {line}"
             observer.say(f"{dataset.path}: {line}")
         has_boxes = any(box is not None for pair in caches[-1].pairs for box in pair.boxes)
         if not has_boxes and not _is_without_drogue(dataset):
             raise ValueError(f"{dataset.path}: shows no drogue in any image; there is nothing to learn from")
     stamps = tuple(
-        DatasetStamp(manifest.name, manifest.dataset_sha256, manifest.manifest_sha256, len(images.pairs))
+        DatasetStamp(
+            manifest.name,
+            manifest.dataset_sha256,
+            manifest.manifest_sha256,
+            sum(pair.split == "train" for pair in images.pairs),
+        )
         for manifest, images in zip((dataset.manifest for dataset in datasets), caches, strict=True)
     )
     if without is not None:
         stamps += (DatasetStamp(_PHOTOGRAPHS, without.sha256, "", len(without.images)),)
     places = [(number, index) for number, cache_ in enumerate(caches) for index in range(len(cache_.pairs))]
-    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), fault, without, tuple(datasets))
+    corpus = Corpus(stamps, size_px, tuple(caches), np.array(places, dtype=np.int64), without, tuple(datasets))
     if not any(len(corpus.boxes(pair, eye)) for pair in corpus.split("train") for eye in (0, 1)):
         raise ValueError(f"{paths[0]}: shows no drogue in any image of the split train; there is nothing to learn from")
     return corpus

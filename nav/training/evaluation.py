@@ -177,22 +177,23 @@ def detect_split(
 ) -> Predictions:
     """Run a detector on the pairs of a split as they were taken, and clip its boxes to the images, as in use.
 
+    Pairs that can no longer be read are left out, and are faults of the corpus.
+
     Args:
         detector: of a file.
         corpus: with the pairs.
         split: which of them.
         advance: called after each pair.
-
-    Raises:
-        ValueError: a pair can no longer be read; the message names the file.
     """
     pairs = [int(pair) for pair in corpus.split(split)]
-    found: list[tuple[Boxes, Boxes]] = []
-    for images in prefetch_map(corpus.stereo_images, pairs, threads=1, ahead=2):
-        candidates = detector.candidates(images, _MIN_SCORE)
-        found += [_in_corpus(candidates[eye], images.size_px, corpus.size_px[::-1]) for eye in EYES]
+    seen = Predictions([], [])
+    for pair, images in zip(pairs, prefetch_map(corpus.stereo_images, pairs, threads=1, ahead=2), strict=True):
+        if images is not None:
+            candidates = detector.candidates(images, _MIN_SCORE)
+            seen.found.extend(_in_corpus(candidates[eye], images.size_px, corpus.size_px[::-1]) for eye in EYES)
+            seen.truth.extend(corpus.boxes(pair, eye) for eye in (0, 1))
         advance()
-    return Predictions([corpus.boxes(pair, eye) for pair in pairs for eye in (0, 1)], found)
+    return seen
 
 
 def _in_corpus(

@@ -63,7 +63,7 @@ def hard_pairs(
         "datasets": [asdict(stamp) for stamp in corpus.datasets],
         "size_px": list(size),
     }
-    known = _read(path, searched)
+    known = _read(path, searched, pairs)
     if known is not None:
         return known
 
@@ -83,9 +83,9 @@ def hard_pairs(
         observer.end()
     smallest_px = SMALLEST_LEARNED_FRACTION * size[0]
     fails = [is_failure(own, *found, smallest_px) for own, found in zip(seen.truth, seen.found, strict=True)]
-    hard: NDArray[np.int64] = pairs[np.reshape(fails, (-1, 2)).any(axis=1)]
+    hard = np.flatnonzero(np.reshape(fails, (-1, 2)).any(axis=1))
     write_text_atomic(path, json.dumps(searched | {"pairs": hard.tolist()}, indent=1) + "\n")
-    return hard
+    return pairs[hard]
 
 
 def is_failure(truth: Boxes, boxes: Boxes, scores: Array, smallest_px: float) -> bool:
@@ -102,12 +102,13 @@ def is_failure(truth: Boxes, boxes: Boxes, scores: Array, smallest_px: float) ->
     return not (is_right.any(axis=1).all() and is_right.any(axis=0)[sought].all())
 
 
-def _read(path: Path, searched: dict[str, Any]) -> NDArray[np.int64] | None:
-    """The pairs in a file of the same search; None where it is missing, damaged or of another one."""
+def _read(path: Path, searched: dict[str, Any], pairs: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Those of some pairs that a file of the same search lists; None where it is missing, damaged or of another one."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         if {key: found[key] for key in searched} == searched:
-            return np.array([int(pair) for pair in found["pairs"]], dtype=np.int64)
-    except (OSError, ValueError, TypeError, KeyError, OverflowError):
+            hard: NDArray[np.int64] = pairs[np.array([int(place) for place in found["pairs"]], dtype=np.int64)]
+            return hard
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, IndexError):
         pass
     return None

@@ -223,7 +223,7 @@ class _Evaluator:
         # The exported files compute in float32.
         exact = ComputeDevice(self.compute.device, bf16=False)
         measure_batch_statistics(network, self.corpus, self.settings.size_at(self.settings.steps - 1), exact)
-        result = TrainingResult(file, step, None, None, DEFAULT_THRESHOLD, self.corpus.fault)
+        result = TrainingResult(file, step, None, None, DEFAULT_THRESHOLD)
         model = trace_onnx(network)
         with TemporaryDirectory() as folder:
             trial = Path(folder) / file.name
@@ -271,7 +271,7 @@ def _evaluate_and_export(out: Path, state: TrainingState, evaluator: _Evaluator)
         last = state.average.network
         of_last, model = evaluator.evaluate(last, state.step, out / LAST_ONNX_FILE, has_test=False)
     write_onnx(model, out / LAST_ONNX_FILE, _metadata(of_last, corpus, settings, last))
-    return result
+    return replace(result, fault=corpus.fault)
 
 
 def _metadata(

@@ -33,7 +33,7 @@ _LOAD_ERRORS = (
     zipfile.BadZipFile, RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError,
     TypeError, IndexError,
 )  # fmt: skip
-_VERSION = 2  # incremented with every change of a checkpoint's contents
+_VERSION = 3  # incremented with every change of a checkpoint's contents
 # After n steps the average spans about the last n/10 of them, until the decay of the settings is reached.
 _RAMP_STEPS = 10
 

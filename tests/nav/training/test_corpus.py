@@ -186,7 +186,7 @@ def test_several_datasets_form_one_sequence_of_pairs(split_dataset: Path, tmp_pa
     rig, frames = {"focal_px": 220.0, "encoding": None}, {"count": 2, "scenes": 1, "empty_fraction": None}
     second = render_toy(tmp_path / "second", seed=6, frames=frames, rig=rig)
     corpus = open_small([split_dataset, second], tmp_path / "cache")
-    assert [(stamp.name, stamp.pairs) for stamp in corpus.datasets] == [("toy", 8), ("toy", 2)]
+    assert [(stamp.name, stamp.train_pairs) for stamp in corpus.datasets] == [("toy", 4), ("toy", 2)]
     assert len(corpus.places) == 10
     alone = open_small([second], tmp_path / "cache")
     np.testing.assert_array_equal(corpus.image(9, 1), alone.image(1, 1))

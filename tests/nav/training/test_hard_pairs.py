@@ -92,9 +92,24 @@ def test_a_network_that_finds_nothing_fails_where_there_are_drogues(ellipse_corp
     assert found(start=replace(start, sha256="0" * 64)) == every
     (tmp_path / HARD_PAIRS_FILE).write_text(fewer)
     assert found(settings.model_copy(update={"size_px": (64, 96)})) == every
-    for damaged in (fewer[:-3], "[4]", json.dumps(listed | {"pairs": [1e999]}), json.dumps(listed | {"pairs": "four"})):
+    for damaged in (
+        fewer[:-3],
+        "[4]",
+        json.dumps(listed | {"pairs": [1e999]}),
+        json.dumps(listed | {"pairs": "four"}),
+        json.dumps(listed | {"pairs": [12]}),
+    ):
         (tmp_path / HARD_PAIRS_FILE).write_text(damaged)
         assert found() == every
+
+
+def test_hard_pairs_stay_the_same_where_another_pair_is_left_out(ellipse_corpus: Corpus, tmp_path: Path) -> None:
+    (cache,), settings = half_without_drogue(ellipse_corpus).caches, settings_with(variant="s")
+    pairs = (cache.pairs[0].model_copy(update={"split": "val"}), *cache.pairs[1:])
+    whole = replace(ellipse_corpus, caches=(replace(cache, pairs=pairs),))
+    start, left_out = random_start(tmp_path, settings), replace(whole, places=whole.places[1:])
+    assert hard_pairs(tmp_path, start, whole, settings, CPU, QUIET).tolist() == [2, 4, 6, 8, 10]
+    assert hard_pairs(tmp_path, start, left_out, settings, CPU, QUIET).tolist() == [1, 3, 5, 7, 9]
 
 
 def test_an_exported_network_is_searched_with_as_it_is(toy_dataset: Path, tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
-from droguekit.cli.main import DONE, WRONG_INPUT, run
+from datasets_manifest.storage.reader import Dataset
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from tests.support.recipe_builder import RecipeTable, between, recipe_text
 
 BASE: RecipeTable = {
@@ -40,6 +42,36 @@ def test_a_recipe_becomes_a_detector(tmp_path: Path, capsys: pytest.CaptureFixtu
     # Known before it looks at the rendered pairs again.
     refused = capsys.readouterr().err.splitlines()[-1]
     assert "belongs to a training that differs in mosaic;" in refused
+
+
+def test_pairs_damaged_after_their_images_were_cached_do_not_cost_a_finished_training(
+    split_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(split_dataset, data)
+    size = ["--size", "96x128", "--image-passes", "4", "--variant", "s", "--threads", "1"]
+    command = ["train", str(data), "--out", str(out), *size]
+    assert run(command) == DONE
+    damaged = [next(e.frame_index for e in Dataset(data).manifest.frames if e.split == of) for of in ("val", "test")]
+    for number in damaged:
+        (data / "frames" / f"{number:06d}" / "left.png").write_bytes(b"damaged")
+    for is_cached in (True, False):
+        for file in ("detector.onnx", "last.onnx"):
+            (out / file).unlink()
+        if not is_cached:
+            shutil.rmtree(out / "cache")
+        capsys.readouterr()
+        assert run(command) == FAULT
+        told = capsys.readouterr()
+        assert "2 pairs have no result by a fault, first pair" in told.err and "left.png" in told.err
+        assert "val: AP50" in told.out and "test: AP50" in told.out
+        assert (out / "detector.onnx").is_file() and (out / "last.onnx").is_file()
+    # The weights would be others with another pair to train on.
+    trained = next(entry.frame_index for entry in Dataset(data).manifest.frames if entry.split == "train")
+    (data / "frames" / f"{trained:06d}" / "left.png").write_bytes(b"damaged")
+    shutil.rmtree(out / "cache")
+    assert run(command) == WRONG_INPUT
+    assert "belongs to a training that differs in datasets" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
