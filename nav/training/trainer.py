@@ -419,7 +419,8 @@ class Trainer:
         validation = self._validate(state, size) if is_due else None
         row = self._row(state, epoch, validation)
         state.rows.append(row)
-        if validation is not None and (stage, validation.ap) > state.best:
+        # Of equally good weights the later ones have learned more, as where none find a drogue yet.
+        if validation is not None and (stage, validation.ap) >= state.best:
             state.best = (stage, validation.ap)
             save_checkpoint(self.out / BEST_FILE, {"network": state.average.network.state_dict(), "step": state.step})
         per_step_s = (state.row_seconds + time.monotonic() - began_s) / len(state.parts)

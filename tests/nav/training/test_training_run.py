@@ -177,6 +177,15 @@ def test_without_a_drogue_to_validate_with_only_the_end_is_validated(
     assert done == [21]
 
 
+def test_of_equal_scores_the_later_weights_are_exported(
+    split_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Short trainings find nothing in any validation; their first weights have learned least."""
+    monkeypatch.setattr(Trainer, "_validate", lambda *_: ValidationScores(0.0, 0.0, 0.0, 0.0))
+    result, told = run(split_dataset, tmp_path, image_passes=16)
+    assert told.count("val AP50") == 2 and result.best_step == 4
+
+
 def test_a_process_that_is_killed_ends_the_training_in_one_line(split_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, "image_passes": 4000, "loader_workers": 2})
 
