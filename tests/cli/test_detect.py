@@ -15,11 +15,14 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.types.estimates import PoseEstimate, read_estimates
-from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.scoring.detection.detection_truth import read_detection_truth
 from nav.detector.ring_detectors import ColorBlobDetector
+from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
+from tests.support.small_datasets import rendered
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +30,28 @@ def detections(smoke_dataset: Path, tmp_path_factory: pytest.TempPathFactory) ->
     out = tmp_path_factory.mktemp("detect") / "boxes.json"
     assert run(["detect", str(smoke_dataset), "--detector", "color-blob", "--out", str(out)]) == DONE
     return out
+
+
+def test_a_damaged_first_record_costs_that_pair_alone_where_each_pair_has_a_drogue_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = recipe_text(
+        name="two-drogues",
+        rig=RIG_160_PX,
+        frames={"count": 3, "scenes": 3, "empty_fraction": 0.0},
+        target={"variants": [{"drogue": name} for name in ("red-8", "red-7")]},
+        distance=between(2.0, 3.0),
+        render={"engine": "analytic"},
+    )
+    dataset, out = rendered(recipe, tmp_path / "dataset"), tmp_path / "boxes.json"
+    first, *others = Dataset(dataset).frame_indices
+    (dataset / "frames" / f"{first:06d}" / "record.json").write_text("{")
+    detecting = [["detect", str(dataset), "--out", str(out)], ["benchmark", str(dataset)]]
+    for command in detecting:
+        assert run([*command, "--detector", "color-blob"]) == FAULT
+        told = capsys.readouterr().err
+        assert f"1 pair has no result by a fault, first pair {first}: " in told and "record.json" in told
+    assert {(box["image_id"] - 1) // 2 for box in json.loads(out.read_text())} == set(others)
 
 
 def test_times_are_of_one_thread(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

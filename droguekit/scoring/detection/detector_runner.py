@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class DetectorRunner:
         self.pairs = len(self._frame_indices)
         if not self.pairs:
             raise ValueError(f"{dataset}: has no pairs")
-        first = detector_of(self._dataset.sought_drogue(self._frame_indices[0]))
+        first = detector_of(self._first_drogue())
         self._latest = first
         self.name = first.name
         # Only networks name one.
@@ -94,6 +95,13 @@ class DetectorRunner:
             raise ValueError(self.faults.line() or "no pair was processed")
         wall_ms, cpu_ms = (1e3 * float(np.median(seconds)) for seconds in (self.wall_s, self.cpu_s))
         return PairTimes(wall_ms=wall_ms, cpu_ms=cpu_ms, pairs=len(self.wall_s))
+
+    def _first_drogue(self) -> DrogueParameters:
+        """The drogue of the first pair whose record can be read: the others are faults when their turn comes."""
+        for index in self._frame_indices:
+            with suppress(ValueError):
+                return self._dataset.sought_drogue(index)
+        return self._dataset.drogue
 
     def _detect(
         self, index: int, detector: Detector, images: StereoImages, least_score: float
