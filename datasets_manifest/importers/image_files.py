@@ -48,21 +48,41 @@ _DAMAGE_LINE: Final = re.compile(rb"^(?:%b)[^\n]*" % _DAMAGE, re.MULTILINE)
 _DECODER_LINE: Final = re.compile(rb"^(?:%b|%b)[^\n]*\n?" % (_DAMAGE, _UNUSUAL), re.MULTILINE)
 
 
+# Whether an image is mirrored first, and then the quarter turns to the left, by its EXIF orientation.
+_TURNS: Final = {2: (True, 0), 3: (False, 2), 4: (True, 2), 5: (True, 1), 6: (False, 3), 7: (True, 3), 8: (False, 1)}
+
+
 def read_image(path: Path) -> tuple[Pixels, bool]:
-    """An image file, as `decode_image_file` gives it.
+    """An image file of a calibrated camera, as `decode_image_file` gives it.
 
     Raises:
         ValueError: it cannot be read or decoded; names the file.
     """
+    return decode_image_file(_read_bytes(path), str(path))
+
+
+def read_photograph(path: Path) -> Pixels:
+    """An image file of any camera, turned as its orientation says, also where OpenCV does not apply it.
+
+    Raises:
+        ValueError: as `decode_image_file`, but for the orientation; names the file.
+    """
+    pixels, said, applied = _decode_with_orientation(_read_bytes(path), str(path))
+    if said == applied:
+        return pixels
+    is_mirrored, quarter_turns = _TURNS[said]
+    return np.ascontiguousarray(np.rot90(pixels[:, ::-1] if is_mirrored else pixels, quarter_turns))
+
+
+def _read_bytes(path: Path) -> NDArray[np.uint8]:
     try:
-        data = np.frombuffer(read_regular(path), dtype=np.uint8)
+        return np.frombuffer(read_regular(path), dtype=np.uint8)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return decode_image_file(data, str(path))
 
 
 def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]:
-    """The image in the bytes of a file.
+    """The image of a calibrated camera in the bytes of a file.
 
     The image is turned as its EXIF orientation says, since `cv2.imread` turns the pictures of a calibration so too.
 
@@ -78,8 +98,19 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
         ValueError: it cannot be decoded, is damaged, has too many pixels, is not of 8 or 16 bits, has several pages, or
             an orientation that OpenCV does not apply; names the image.
     """
+    pixels, said, applied = _decode_with_orientation(data, name)
+    if said != applied:
+        raise ValueError(
+            f"{name}: has the orientation {said} of EXIF, which cv2.imread does not apply, so that a calibration may "
+            "not fit; save it upright"
+        )
+    return pixels, applied != _UPRIGHT
+
+
+def _decode_with_orientation(data: NDArray[np.uint8], name: str) -> tuple[Pixels, int, int]:
+    """The image, as OpenCV decodes it, the orientation that it has, and the one that OpenCV applied."""
     _check_size(data, name)
-    orientation = _orientation(data, name)
+    said, applied = _orientations(data, name)
     try:
         image, damage = _decoded(data)
     except (cv2.error, ValueError) as error:
@@ -89,7 +120,7 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
     if damage is not None:
         raise ValueError(f"{name}: is damaged ({damage}); copy it anew, or save it again if it looks right")
     pixels = np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-    return pixels, orientation != _UPRIGHT
+    return pixels, said, applied
 
 
 def _decoded(data: NDArray[np.uint8]) -> tuple[Any, str | None]:
@@ -158,15 +189,15 @@ def _check_size(data: NDArray[np.uint8], name: str) -> None:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _orientation(data: NDArray[np.uint8], name: str) -> int:
-    """The EXIF orientation, 1 to 8, that OpenCV applies to an image; 1 where the image cannot be identified.
+def _orientations(data: NDArray[np.uint8], name: str) -> tuple[int, int]:
+    """The EXIF orientation of an image, 1 to 8, and the same or 1, as OpenCV applies it; 1 where it is no image.
 
     Raises:
-        ValueError: it has an orientation that OpenCV does not apply, or several pages.
+        ValueError: it has several pages.
     """
     file = data.tobytes()
     if not file.startswith(_TIFF_AND_WEBP) and not any(mark in file for mark in _ORIENTATION_MARKS):
-        return _UPRIGHT
+        return _UPRIGHT, _UPRIGHT
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(file)) as image:
             kind, pages = image.format, int(getattr(image, "n_frames", 1))
@@ -175,15 +206,8 @@ def _orientation(data: NDArray[np.uint8], name: str) -> int:
             exif.load(image.info.get("exif", b""))
             applied = said if kind == "TIFF" else int(exif.get(ExifTags.Base.Orientation, _UPRIGHT))
     except Exception:  # whatever a damaged file makes its reader raise; whether it is an image, OpenCV decides
-        return _UPRIGHT
+        return _UPRIGHT, _UPRIGHT
     if pages > 1 and kind != "MPO":
         raise ValueError(f"{name}: holds {pages} images; save each as a file of its own")
     said, applied = (number if 1 < number <= 8 else _UPRIGHT for number in (said, applied))
-    if kind not in _TURNED_BY_OPENCV:
-        applied = _UPRIGHT
-    if said != applied:
-        raise ValueError(
-            f"{name}: has the orientation {said} of EXIF, which cv2.imread does not apply, so that a calibration may "
-            "not fit; save it upright"
-        )
-    return applied
+    return said, applied if kind in _TURNED_BY_OPENCV else _UPRIGHT

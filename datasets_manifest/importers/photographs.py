@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.importers.image_files import IMAGE_SUFFIXES, read_image
+from datasets_manifest.importers.image_files import IMAGE_SUFFIXES, read_photograph
 
 # Pictures of more bits are shown with the brightest thousandth of them white.
 _WHITE_QUANTILE = 0.999
@@ -46,12 +46,12 @@ def _refuse_folder(error: OSError) -> None:
 
 
 def shown_photograph(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) or (H, W) uint8 picture of a file, for screens.
+    """(H, W, 3) or (H, W) uint8 picture of a file, upright, for screens.
 
     Raises:
         ValueError: it cannot be read; names the file.
     """
-    pixels, _ = read_image(path)
+    pixels = read_photograph(path)
     if pixels.dtype == np.uint8:
         return np.asarray(pixels, dtype=np.uint8)
     white = max(float(np.quantile(pixels, _WHITE_QUANTILE)), 1.0)
