@@ -22,7 +22,14 @@ from nav.pair_measurement import PairMeasurement, regions_of
 from nav.pair_navigator import DETECTOR, PairNavigator
 from nav.pose.pose_method import Solution
 from nav.tracking.region import rim_boxes
-from nav.tracking.tracker import REDETECT_EVERY, Tracker, begins_sequence, is_same_place, open_tracker
+from nav.tracking.tracker import (
+    MOST_UNCONFIRMED,
+    REDETECT_EVERY,
+    Tracker,
+    begins_sequence,
+    is_same_place,
+    open_tracker,
+)
 
 # Where both eyes have lost the drogue the detector runs at once. Where one has, it runs at the second consecutive miss
 # and every third one after it, since the drogue may be out of one view for long.
@@ -42,6 +49,7 @@ class TrackedDetector:
 
     Pairs must come in the order of their time. An eye that lost the drogue has no box until it is found again. The
     detector also runs at intervals while nothing is lost, since a tracker cannot know that it follows the wrong thing.
+    After `MOST_UNCONFIRMED` pairs in which it has found nothing, nothing is followed any more.
 
     Attributes:
         name: names of detector and tracker, joined by a plus sign.
@@ -54,7 +62,7 @@ class TrackedDetector:
         self._image_kind: _ImageKind | None = None
         self._is_following = False
         self._misses: dict[Eye, int] = {}
-        self._since_detection = 0
+        self._since_detection = self._unconfirmed = 0
 
     def restart(self) -> None:
         """Let the detector look at the next pair: one between them was lost."""
@@ -71,10 +79,14 @@ class TrackedDetector:
         followed = self._tracker.follow(images, _NOWHERE)
         lost = [eye for eye in EYES if followed.of(eye) is None]
         self._misses = {eye: self._misses.get(eye, 0) + 1 for eye in lost}
-        self._since_detection += 1
+        self._since_detection, self._unconfirmed = self._since_detection + 1, self._unconfirmed + 1
         if not self._wants_detector(lost):
             return followed
         found, self._since_detection = self._detector.detect(images), 0
+        if found != _NOWHERE:
+            self._unconfirmed = 0
+        elif self._unconfirmed >= MOST_UNCONFIRMED:
+            return self._start_from(images, found)
         both = [eye for eye in EYES if eye not in lost and found.of(eye) is not None]
         if len(lost) == len(EYES) or any(not _both_show_same(followed.of(eye), found.of(eye)) for eye in both):
             return self._start_from(images, found)
@@ -98,7 +110,7 @@ class TrackedDetector:
     def _start_from(self, images: StereoImages, found: StereoDetection) -> StereoDetection:
         """The detector's boxes, from which the tracker starts anew."""
         self._is_following = found != _NOWHERE
-        self._misses, self._since_detection = {}, 0
+        self._misses, self._since_detection, self._unconfirmed = {}, 0, 0
         if self._is_following:
             self._tracker.start(images, found)
         return found

@@ -71,7 +71,8 @@ def detect(
             "--tracker",
             metavar="NAME",
             help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector runs "
-            "when the drogue is lost, and on every 25th pair. docs/explanation/tracking.md.",
+            "when the drogue is lost, and on every 25th pair. What it does not find for 75 pairs is given up. "
+            "docs/explanation/tracking.md.",
         ),
     ] = None,
     mono: Annotated[

@@ -21,6 +21,12 @@ from nav.tracking.region import Box, EyeImage, box_center, box_size, eye_image, 
 BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
 REDETECT_EVERY = 25
 """The detector checks a tracker after this many pairs: once a second at the seed paper's 25 pairs a second."""
+MOST_UNCONFIRMED = 3 * REDETECT_EVERY
+"""After this many pairs without any detection, what is followed is given up: at the third check without a result.
+
+A detector may overlook a drogue that is near or blurred, but a false detection would be followed for ever. To give up a
+drogue costs little: from then on the detector looks for it at every pair.
+"""
 # A longer time between two pairs separates two sequences. [s]
 _LONGEST_GAP_S = 1.0
 # Boxes with a smaller intersection over union show different things.

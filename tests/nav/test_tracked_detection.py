@@ -13,7 +13,7 @@ from geometry.stereo import EYES
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.ring_detectors import ColorBlobDetector
 from nav.tracked_detection import TrackedDetector, tracked_detector_factory
-from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
+from nav.tracking.tracker import MOST_UNCONFIRMED, REDETECT_EVERY, begins_sequence, open_tracker
 from tests.support.painted_sequences import RATE_HZ, Look, Place, film, overlap
 
 
@@ -138,6 +138,41 @@ def test_a_false_first_box_is_corrected_by_a_later_detection() -> None:
     assert min(overlaps(found[REDETECT_EVERY - 1], false)) > 0.9
     assert min(min(overlaps(each, true)) for each in found[REDETECT_EVERY:]) > 0.9
     assert detector.asked == 2
+
+
+class ForgetfulDetector(CountingDetector):
+    """A detector that knows the drogue at some of its calls alone."""
+
+    def __init__(self, knows: tuple[int, ...]) -> None:
+        super().__init__(load_drogue("red-8"))
+        self._knows = knows
+
+    def detect(self, images: StereoImages) -> StereoDetection:
+        found = super().detect(images)
+        return found if self.asked in self._knows else StereoDetection(None, None)
+
+
+def still_pairs(count: int) -> list[StereoImages]:
+    (pair,) = film([Place(300, 240, 60)])
+    return [replace(pair, time_s=index / RATE_HZ) for index in range(count)]
+
+
+@pytest.mark.parametrize("name", ["bernoulli", "flow", "pose-predict"])
+def test_what_the_detector_does_not_find_at_three_checks_is_followed_no_longer(name: str) -> None:
+    detector = ForgetfulDetector(knows=(1,))
+    following = TrackedDetector(detector, open_tracker(name))
+    found = [following.detect(images).left is not None for images in still_pairs(MOST_UNCONFIRMED + 10)]
+    assert MOST_UNCONFIRMED == 3 * REDETECT_EVERY
+    assert found == [True] * MOST_UNCONFIRMED + [False] * 10
+    # At the start, at three checks, and from then on at every pair.
+    assert detector.asked == 1 + 3 + 9
+
+
+def test_a_drogue_that_the_detector_overlooks_twice_is_followed() -> None:
+    detector = ForgetfulDetector(knows=(1, 4, 7))
+    following = TrackedDetector(detector, open_tracker("flow"))
+    assert all(following.detect(images).left is not None for images in still_pairs(6 * REDETECT_EVERY + 10))
+    assert detector.asked == 7
 
 
 def test_without_a_drogue_the_detector_runs_at_every_pair() -> None:
