@@ -255,6 +255,7 @@ class ConeBody(_Body):
     web_fraction: Annotated[float, Field(ge=0.1, le=0.8)] = 0.3
 
 
+BODY_FAMILIES = ("basket", "petals", "ribbons", "cone")
 DrogueBody = Annotated[BasketBody | PetalBody | RibbonBody | ConeBody, Field(discriminator="family")]
 
 

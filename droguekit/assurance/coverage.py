@@ -186,17 +186,17 @@ def _crossing(
 
 def coverage_lines(coverage: Coverage) -> Iterator[str]:
     """What a terminal shows: each crossing in a line, and the cells that lack pairs."""
-    yield f"{coverage.dataset}: {coverage.pairs} pairs against the domain {coverage.domain}"
+    yield f"{coverage.dataset}: {_counted(coverage.pairs, 'pair')} against the domain {coverage.domain}"
     for name, pairs in coverage.outside.items():
         if pairs:
-            yield f"outside the domain's {name}: {pairs} pairs"
+            yield f"outside the domain's {name}: {_counted(pairs, 'pair')}"
     for crossing in coverage.crossings:
         lacking = crossing.lacking
-        state = f"{len(lacking)} lack pairs" if lacking else "all have enough"
-        cells = f"{len(crossing.cells)} cells, each to have {crossing.fewest_pairs} pairs"
+        state = f"{len(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} pairs" if lacking else "all have enough"
+        cells = f"{_counted(len(crossing.cells), 'cell')}, each to have {_counted(crossing.fewest_pairs, 'pair')}"
         yield f"{' x '.join(crossing.of)}: {cells}: {state}"
         for cell in lacking[:_MOST_LINES]:
-            yield f"  {cell_name(crossing, cell)}: {cell.pairs} pairs"
+            yield f"  {cell_name(crossing, cell)}: {_counted(cell.pairs, 'pair')}"
         if len(lacking) > _MOST_LINES:
             yield f"  and {len(lacking) - _MOST_LINES} more"
         for name in coverage.scored:
@@ -208,6 +208,10 @@ def coverage_lines(coverage: Coverage) -> Iterator[str]:
                     f"  {name} is worst at {cell_name(crossing, worst)}: {share.hits} of {share.count} solved, "
                     f"{100 * low:.0f} to {100 * high:.0f} %"
                 )
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def cell_name(crossing: CrossingCoverage, cell: DomainCell) -> str:

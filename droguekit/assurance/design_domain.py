@@ -7,18 +7,22 @@ A domain is a TOML file. Its `quantities` are numbers with edges between bins, o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from itertools import pairwise, product
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, get_args
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.types.environment import GROUND_KINDS
 from datasets_manifest.types.records import PairRecord
+from datasets_manifest.types.video_camera import Spectrum
+from drogue_models.bodies import BODY_FAMILIES
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
+from drogue_models.tankers.tanker import TankerType
 from drogue_models.untrusted_files import parse_toml, read_text
 
 SHIPPED = ("probe-and-drogue",)
@@ -109,6 +113,25 @@ WORDS: dict[str, Callable[[PairRecord], str | None]] = {
     "sensor": lambda record: record.frame.sensor.name,
 }
 """Words of a pair, likewise."""
+CLOSED_WORDS: dict[str, tuple[str, ...]] = {
+    "drogue": ("none", "ring", *BODY_FAMILIES),
+    "markers": ("some", "none"),
+    "tanker": ("none", "wing", *get_args(TankerType)),
+    "clouds": ("none", "above", "below", "around"),
+    "ground": GROUND_KINDS,
+    "camera": ("ideal", *get_args(Spectrum)),
+}
+"""All words that there are; families and sensors have the names that a recipe gives them."""
+
+
+def bin_names(edges: Sequence[float], fewest_digits: int) -> tuple[str, ...]:
+    """A name for each bin, with as many digits as tell all edges apart."""
+    texts: list[str] = []
+    for digits in range(fewest_digits, 18):  # 17 tell all numbers apart
+        texts = [f"{edge:.{digits}g}" for edge in edges]
+        if len(set(texts)) == len(texts):
+            break
+    return tuple(f"{low} to {high}" for low, high in pairwise(texts))
 
 
 class DomainQuantity(FrozenModel):
@@ -139,7 +162,7 @@ class DomainQuantity(FrozenModel):
     def bins(self) -> tuple[str, ...]:
         """Names of the bins."""
         if self.edges is not None:
-            return tuple(f"{low:g} to {high:g}" for low, high in pairwise(self.edges))
+            return bin_names(self.edges, fewest_digits=6)
         return self.values or ()
 
 
@@ -178,6 +201,11 @@ class DesignDomain(FrozenModel):
                 raise ValueError(f"quantities.{name}: no such quantity; there are {', '.join([*NUMBERS, *WORDS])}")
             if (quantity.edges is not None) != (name in NUMBERS):
                 raise ValueError(f"quantities.{name}: needs {'edges' if name in NUMBERS else 'values'}")
+            known = CLOSED_WORDS.get(name, quantity.values or ())
+            if unknown := [word for word in quantity.values or () if word not in known]:
+                raise ValueError(
+                    f"quantities.{name}: no such value: {', '.join(unknown)}; there are {', '.join(known)}"
+                )
         for crossing in self.cells:
             for name in crossing.of:
                 if name not in self.quantities:

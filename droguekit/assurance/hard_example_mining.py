@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from datasets_manifest.storage.storage import Location, join, open_storage
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.untrusted_files import read_text
+from droguekit.assurance.design_domain import bin_names
 from droguekit.assurance.solved_cases import solved_cases
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.resume import differing_keys
@@ -277,7 +277,7 @@ def _change_laws(
         yield law
     if old.distance.low_m is not None and old.distance.low_m != old.distance.high_m:
         edges_m, shares = _distance_bins(old.distance, choices.distance_bins)
-        names = _bin_names(edges_m)
+        names = [f"{name} m" for name in bin_names(edges_m, fewest_digits=3)]
 
         def bin_of(family: str, drogue: str, distance_m: float | None) -> str:
             return names[min(max(int(np.searchsorted(edges_m, distance_m or 0.0, "right")) - 1, 0), len(names) - 1)]
@@ -324,15 +324,6 @@ def _distance_bins(law: DistanceLaw, count: int) -> tuple[list[float], list[floa
         return list(law.edges_m), [weight / total for weight in law.weights]
     inner = sorted(float(f"{distance_at(law, place / count):.12g}") for place in range(1, count))
     return [float(law.low_m or 0.0), *inner, float(law.high_m or 0.0)], [1.0 / count] * count
-
-
-def _bin_names(edges_m: Sequence[float]) -> list[str]:
-    """A name for each bin, with as many digits as tell all edges apart."""
-    for digits in range(3, 18):
-        texts = [f"{edge:.{digits}g}" for edge in edges_m]
-        if len(set(texts)) == len(texts):
-            break
-    return [f"{low} to {high} m" for low, high in pairwise(texts)]
 
 
 def _mined(

@@ -12,7 +12,7 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
 from droguekit.assurance.coverage import Coverage, CrossingCoverage, measure_coverage, worst_cell
-from droguekit.assurance.design_domain import SHIPPED, load_domain
+from droguekit.assurance.design_domain import CLOSED_WORDS, SHIPPED, WORDS, DesignDomain, load_domain
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import Array, RigidTransform
 from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
@@ -80,6 +80,25 @@ def test_cells_hold_the_pairs_of_the_records(dataset: Path, domain: Path) -> Non
     assert not of(found, "distance_m").lacking
 
 
+def test_bins_of_close_edges_stay_apart(dataset: Path) -> None:
+    """Six digits name all of them alike; the pairs of the first bin lie in no other."""
+    first_m, *_ = np.unique(distances_m(dataset))
+    edges_m = (float(first_m), float(first_m) + 1e-7, float(first_m) + 2e-7)
+    domain = DesignDomain.model_validate(
+        {"name": "close", "quantities": {"distance_m": {"edges": edges_m}}, "cells": [{"of": ["distance_m"]}]}
+    )
+    cells = of(measure_coverage(dataset, domain), "distance_m").cells
+    assert len({cell.bins for cell in cells}) == 2
+    assert [cell.pairs for cell in cells] == [1, 0]
+
+
+def test_words_of_pairs_are_among_those_that_a_domain_may_name(dataset: Path) -> None:
+    for record in Dataset(dataset).records():
+        for name, known in CLOSED_WORDS.items():
+            word = WORDS[name](record)
+            assert word is None or word in known
+
+
 def test_an_empty_cell_ends_the_command_with_a_fault(
     dataset: Path, domain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,7 +106,7 @@ def test_an_empty_cell_ends_the_command_with_a_fault(
     command = ["coverage", str(dataset), "--odd", str(domain), "--json", str(numbers), "--html", str(page)]
     assert run(command) == FAULT
     told = capsys.readouterr().out
-    assert "distance_m x sun_elevation_deg: 6 cells, each to have 1 pairs: 3 lack pairs" in told
+    assert "distance_m x sun_elevation_deg: 6 cells, each to have 1 pair: 3 lack pairs" in told
     assert "  distance_m 2 to 4, sun_elevation_deg -90 to 0: 0 pairs" in told
     assert Coverage.model_validate(json.loads(numbers.read_text())) == measure_coverage(
         dataset, load_domain(str(domain))
@@ -147,12 +166,17 @@ def test_boxes_are_scored_cell_by_cell(dataset: Path, domain: Path, tmp_path: Pa
         ('of = ["distance_m"]', 'of = ["roll_deg"]', r"cells: 'roll_deg' is none of the quantities"),
         ("edges = [2.0, 4.0, 8.0, 10.0]", 'values = ["a"]', r"quantities\.distance_m: needs edges"),
         ("name =", "name", "near.toml: not valid TOML"),
+        (
+            "[[cells]]",
+            '[quantities.tanker]\nvalues = ["wing", "zeppelin"]\n[[cells]]',
+            r"quantities\.tanker: no such value: zeppelin; there are none, wing, four-jet",
+        ),
     ],
 )
 def test_a_wrong_domain_is_one_clear_line(
     dataset: Path, domain: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, told: str
 ) -> None:
-    domain.write_text(DOMAIN.replace(old, new))
+    domain.write_text(DOMAIN.replace(old, new, 1))
     with pytest.raises(ValueError, match=told):
         load_domain(str(domain))
     assert run(["coverage", str(dataset), "--odd", str(domain)]) == WRONG_INPUT

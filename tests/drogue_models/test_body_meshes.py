@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +13,7 @@ from pydantic import ValidationError
 from scipy.spatial import ConvexHull
 
 from drogue_models.bodies import (
+    BODY_FAMILIES,
     BasketBody,
     Canopy,
     ConeBody,
@@ -105,7 +108,7 @@ def bodies(draw: st.DrawFn) -> DrogueParameters:
         ),
         "lamps": draw(st.sampled_from([None, RimLamps(count=7, radius_m=share(0.002, 0.012))])),
     }  # fmt: skip
-    family = draw(st.sampled_from(["basket", "petals", "ribbons", "cone"]))
+    family = draw(st.sampled_from(BODY_FAMILIES))
     body: DrogueBody
     if family == "basket":
         canopy = Canopy(
@@ -219,3 +222,8 @@ def test_new_fields_leave_the_json_of_other_drogues_as_it_was() -> None:
     for name in FAMILIES:
         drogue = load_drogue(name)
         assert DrogueParameters.model_validate_json(drogue.model_dump_json()) == drogue
+
+
+def test_the_families_are_those_of_the_bodies() -> None:
+    bodies, _ = get_args(DrogueBody)
+    assert tuple(body.model_fields["family"].default for body in get_args(bodies)) == BODY_FAMILIES
