@@ -193,8 +193,7 @@ def precision_recall(matches: Matches) -> PrecisionRecallCurve:
 def best_f1(matches: Matches) -> OperatingPoint | None:
     """The threshold with the highest F1, midway to the next lower score or to 0; None where no box is right.
 
-    Of equally good thresholds it is the lowest: half of the boxes that it adds are right. Training chooses the
-    threshold of its network by the same rule, with the best box of each image.
+    Of equally good thresholds it is the lowest: half of the boxes that it adds are right.
     """
     threshold, boxes, true = _passing(matches)
     if not true.any():
