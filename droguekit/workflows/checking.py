@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from droguekit.workflows.recipe_check import check_lines, check_recipe
+from droguekit.workflows.recipe_check import check_lines, check_recipe, with_drogue_in_all_pairs
 from droguekit.workflows.rendering import open_recipe
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 # The part of an image around the drogue, in halves of its box, and at least so many pixels to each side.
 _AROUND, _LEAST_AROUND_PX = 1.5, 12
-_MOST_TRIES = 20
 
 
 def checked_lines(
@@ -55,20 +54,15 @@ def checked_lines(
 
 
 def _picture(recipe: Recipe, distance_m: float) -> DroguePicture:
-    """The drogue at a distance, rendered in the recipe's first scene that shows it."""
+    """The drogue at a distance, rendered in the recipe's first scene."""
     from droguekit.batch.frame_task import process_engine, render_frame
     from droguekit.numerical_threads import one_thread
     from droguekit.visualization.check_page import DroguePicture
-    from scenes.sampler import sample_frame
 
     law = recipe.distance.model_copy(update={"law": "stations", "stations_m": (distance_m,)})
-    near = recipe.model_copy(update={"distance": law, "sequence": None})
-    tries = range(min(recipe.frames.count, _MOST_TRIES))
-    frame = next((k for k in tries if sample_frame(near, k).left_from_drogue is not None), None)
-    if frame is None:
-        raise ValueError(f"frames: the first {len(tries)} show no drogue; lower frames.empty_fraction")
+    near = with_drogue_in_all_pairs(recipe).model_copy(update={"distance": law, "sequence": None})
     with one_thread():
-        rendered = render_frame(near, frame, process_engine(recipe.render.engine))
+        rendered = render_frame(near, 0, process_engine(recipe.render.engine))
     box, image = rendered.record.views.left.box_full_xywh_px, rendered.images.left
     assert box is not None
     left, top, width, height = box

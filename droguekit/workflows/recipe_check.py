@@ -28,7 +28,8 @@ LEAST_SNR = 5.0
 # Where a light disc lies in its pixel: a regular pattern, for means over it.
 _PHASES = np.stack(np.meshgrid([-0.375, -0.125, 0.125, 0.375], [-0.375, -0.125, 0.125, 0.375]), axis=-1).reshape(-1, 2)
 _SPARE_PX, _CELLS = 4, 8
-_WITHIN_PIXEL_PX = 0.2
+# A disc up to this radius lies within one pixel, and its place is known to so much before anything is measured.
+_WITHIN_PIXEL_RADIUS_PX, _WITHIN_PIXEL_SIGMA_PX = 0.5, 0.2
 _SMALLEST_RADIUS_PX, _LEAST_GAP_PX, _LEAST_BOX_PX = 0.3, 3.0, 16.0
 _MOST_CLIPPED = 0.95
 # Lamps are sought between these, by steps of a factor of 3, and then to 2 %.
@@ -48,7 +49,8 @@ class MarkerPrediction:
         contrast: light of the marker above that beside it, over that beside it.
         snr: light of the marker over the noise of a fit.
         clipped_fraction: share of the marker's light in pixels above the sensor's range.
-        centroid_sigma_px: Cramer-Rao bound of a centre, per axis; None without contrast.
+        centroid_sigma_px: Cramer-Rao bound of a centre, per axis; None where a marker is not seen: without contrast, or
+            below `LEAST_SNR`.
         x_sigma_m, z_sigma_m: bound of the position across and along the line of sight, by both eyes; None where open.
         pitch_sigma_deg: bound of the attitude; None where open.
     """
@@ -128,6 +130,7 @@ def check_recipe(recipe: Recipe) -> RecipeCheck:
             f"check: the drogue {recipe.drogue.name} has no markers to predict; the method joint-rim takes its pose "
             "from the rim where it stands dark before the sky"
         )
+    recipe = with_drogue_in_all_pairs(recipe)
     scenes = dict(_scenes(recipe))
     lights = tuple(scene.told(light) for light, scene in scenes.items())
     markers = tuple(
@@ -137,6 +140,11 @@ def check_recipe(recipe: Recipe) -> RecipeCheck:
     )
     check = RecipeCheck(recipe.name, lights, markers, ())
     return replace(check, advice=tuple(_advice(recipe, check, scenes)))
+
+
+def with_drogue_in_all_pairs(recipe: Recipe) -> Recipe:
+    """The recipe without its empty pairs, which have no markers to look at."""
+    return recipe.model_copy(update={"frames": recipe.frames.model_copy(update={"empty_fraction": 0.0})})
 
 
 def check_lines(check: RecipeCheck) -> Iterator[str]:
@@ -220,9 +228,7 @@ def _scenes(recipe: Recipe) -> Iterator[tuple[str, _Scene]]:
     from scenes.sampler import automatic_exposure, recipe_of_scene, sample_frame, scene_of_frame
     from scenes.sky.photometry import luminance
 
-    index = next((k for k in range(recipe.frames.count) if recipe.frames.empty_fraction < 1), 0)
-    own = recipe_of_scene(recipe, scene_of_frame(recipe, index))
-    frame = sample_frame(recipe, index)
+    own, frame = recipe_of_scene(recipe, scene_of_frame(recipe, 0)), sample_frame(recipe, 0)
     mapped = frame.environment.map is not None
     for light, elevation_deg in {"map": frame.environment.sun_elevation_deg}.items() if mapped else LIGHTS.items():
         changes: dict[str, object] = {} if mapped else {"sun_elevation_deg": elevation_deg, "clouds": (), "moon": None}
@@ -234,7 +240,7 @@ def _scenes(recipe: Recipe) -> Iterator[tuple[str, _Scene]]:
         sky = ambient.radiance(ahead.astype(np.float32).reshape(1, 1, 3))[0, 0].astype(np.float64)
         drogue = recipe.drogue
         behind = drogue.face_reflectance_rgb if drogue.body is None else drogue.canopy_reflectance_rgb
-        lamp = np.zeros(3) if frame.drogue is None else lamp_radiance_rgb(frame, FIRST_MARKER_ID)
+        lamp = lamp_radiance_rgb(frame, FIRST_MARKER_ID)
         color = np.array(drogue.marker_emission_rgb)
         unit = lamp / drogue.marker_luminance_cd_m2 if lamp.any() else color / max(float(luminance(color)), 1e-9)
         face, paint = (np.array(each) * lux / np.pi for each in (behind, drogue.marker_reflectance_rgb))
@@ -303,10 +309,10 @@ def _marker_light(recipe: Recipe, scene: _Scene, scale_px_per_m: float) -> tuple
         above += share * float((own * (mean_e - behind_e)).sum(axis=(1, 2)).mean())
     contrast = above / max(beside, 1e-9)
     snr = float(np.sqrt(light2).mean())
-    if contrast <= 0 or snr <= 0:
+    if contrast <= 0 or snr < LEAST_SNR:
         return contrast, snr, clipped / whole, None
-    # A disc within one pixel of this sensor is known to lie in it.
-    sigma_px = float(np.sqrt((1 / (information + _WITHIN_PIXEL_PX**-2)).mean()))
+    known = _WITHIN_PIXEL_SIGMA_PX**-2 if radius_px < _WITHIN_PIXEL_RADIUS_PX else 0.0
+    sigma_px = float(np.sqrt((1 / (information + known)).mean()))
     return contrast, snr, clipped / whole, sigma_px
 
 
@@ -361,21 +367,25 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     lit = recipe.drogue.marker_luminance_cd_m2
     name = "lamps" if lit else "markers"
     when = {"day": "by day", "dusk": "at dusk", "night": "at night"}.get(light.light, "in this light")
-    if light.marker_cd_m2 < light.sky_cd_m2 and recipe.drogue.body is None:
-        wanted = _rounded(1.5 * light.sky_cd_m2)
-        use = f"{_text(wanted)} cd/m2" if lit else f"lamps of {_text(wanted)} cd/m2"
-        if recipe.sensor.band_nm is None:
-            use += " or infrared lamps and a filter (rig preset mono-850)"
-        against = f"{_text(light.marker_cd_m2)} against {_text(light.sky_cd_m2)} cd/m2"
-        yield f"{name} are darker than the sky {when}, {against}: use {use}"
-    faint = [row for row in rows if row.snr < LEAST_SNR or row.contrast <= 0]
+
+    def enough(faintest: MarkerPrediction) -> str:
+        least_cd_m2 = _least_luminance(recipe, scene, recipe.rig.delivered_focal_px / faintest.distance_m)
+        return "" if least_cd_m2 is None else f"{'' if lit else 'lamps of '}{_text(_rounded(least_cd_m2))} cd/m2"
+
+    dark = [row for row in rows if row.contrast <= 0]
+    if dark:
+        infrared = "infrared lamps and a filter (rig preset mono-850)" if recipe.sensor.band_nm is None else ""
+        uses = [use for use in (enough(min(dark, key=lambda row: row.contrast)), infrared) if use]
+        yield (
+            f"{name} are darker than what is beside them {when} from {dark[0].distance_m:.3g} m on: use "
+            f"{' or '.join(uses) or 'brighter lamps'}"
+        )
+    faint = [row for row in rows if row.contrast > 0 and row.snr < LEAST_SNR]
     if faint:
-        faintest = min(faint, key=lambda row: (row.contrast > 0, row.snr))
-        enough = _least_luminance(recipe, scene, recipe.rig.delivered_focal_px / faintest.distance_m)
-        use = "" if enough is None else f"{'' if lit else 'lamps of '}{_text(_rounded(enough))} cd/m2, "
+        uses = [use for use in (enough(min(faint, key=lambda row: row.snr)), "a wider aperture") if use]
         yield (
             f"{name} are below {LEAST_SNR:g} deviations of the noise {when} from {faint[0].distance_m:.3g} m on: use "
-            f"{use}a wider aperture or a longer exposure"
+            f"{', '.join(uses)} or a longer exposure"
         )
     clipped = [row for row in rows if row.clipped_fraction > _MOST_CLIPPED]
     if clipped:

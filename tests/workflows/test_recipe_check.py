@@ -100,8 +100,8 @@ def test_more_noise_a_larger_error(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         (
-            {"luminance": 2000.0, "paint": 0.02},
-            r"lamps are darker than the sky by day, [\d,]+ against [\d,]+ cd/m2: use [\d,]+ cd/m2 or",
+            {"luminance": 0.0, "paint": 0.02},
+            r"markers are darker than what is beside them by day from 6 m on: use lamps of [\d,]+ cd/m2 or infrared",
         ),
         (
             {"luminance": 0.0},
@@ -118,6 +118,43 @@ def test_more_noise_a_larger_error(tmp_path: Path) -> None:
 def test_what_will_fail_is_told_with_what_to_change(tmp_path: Path, changes: dict[str, float], message: str) -> None:
     advice = "\n".join(checked(written(tmp_path, **changes)).advice)
     assert re.search(message, advice), advice
+
+
+def test_markers_darker_than_the_sky_but_brighter_than_the_face_do_not_fail(tmp_path: Path) -> None:
+    """Painted markers of the common kind: the sky behind the drogue is brighter, and fits still find them by day."""
+    check = checked(written(tmp_path, luminance=0.0, radius=0.019, high=20.0))
+    day = check.lights[0]
+    assert day.face_cd_m2 < day.marker_cd_m2 < day.sky_cd_m2
+    assert min(row.contrast for row in check.of_light("day")) > 0
+    assert not any("by day" in sentence for sentence in check.advice)
+
+
+def test_a_marker_that_noise_hides_has_no_error_of_its_centre(tmp_path: Path) -> None:
+    """However large it is: nothing but its own image tells where in many pixels a marker lies."""
+    night = checked(written(tmp_path, luminance=0.0, radius=0.019)).of_light("night")
+    assert night[0].radius_px > 5 and max(row.snr for row in night) < 5
+    assert {(row.centroid_sigma_px, row.x_sigma_m, row.z_sigma_m, row.pitch_sigma_deg) for row in night} == {
+        (None,) * 4
+    }
+
+
+def test_the_error_of_a_large_markers_centre_falls_as_one_over_its_light(tmp_path: Path) -> None:
+    """Lamps at night before the camera's noise alone: no knowledge but the image's bounds the error."""
+    one, other = (checked(written(tmp_path, luminance, 0.019)).of_light("night")[0] for luminance in (0.2, 0.4))
+    assert one.radius_px > 5 and one.snr > 5
+    assert one.centroid_sigma_px is not None and other.centroid_sigma_px is not None
+    ratio = one.centroid_sigma_px / other.centroid_sigma_px
+    # The noise is that of reading, to which the lamp's own shot noise adds little.
+    assert ratio == pytest.approx(other.snr / one.snr, rel=0.02) and 1.8 < ratio < 2.0
+
+
+def test_empty_pairs_do_not_hide_the_markers(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    some, page = checked(file), tmp_path / "check.html"
+    file.write_text(file.read_text().replace("scenes = 1\n", "scenes = 1\nempty_fraction = 1.0\n"))
+    assert checked(file) == some
+    assert run(["check", str(file), "--engine", "analytic", "--html", str(page)]) == DONE
+    assert page.exists()
 
 
 @pytest.mark.parametrize("luminance", [0.0, 0.002])
