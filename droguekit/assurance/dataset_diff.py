@@ -70,7 +70,12 @@ class DatasetDiff(FrozenModel):
     @property
     def differs(self) -> bool:
         """Whether anything differs that draws do not explain."""
-        return any(law.differs for law in (*self.labels, *self.pixels))
+        return any(law.differs for law in self._laws)
+
+    @property
+    def can_tell(self) -> bool:
+        """Whether a difference of any law could be told; of the very same frames the labels are known to agree."""
+        return self._are_same or len(self.untold) < len(self._laws)
 
     @property
     def verdict(self) -> str:
@@ -82,7 +87,7 @@ class DatasetDiff(FrozenModel):
         ]
         if laws:
             return "; ".join(laws)
-        if self.same_frames == self.pairs[0] == self.pairs[1]:
+        if self._are_same:
             of_pixels = (
                 "pixels were not compared"
                 if not self.compared[0]
@@ -91,12 +96,23 @@ class DatasetDiff(FrozenModel):
                 else "pixels differ in value, not in law"
             )
             return f"the same {self.pairs[0]} frames; {of_pixels}"
-        return "nothing differs that draws do not explain"
+        if not self.can_tell:
+            return "too few scenes or pairs to tell any difference"
+        few = f"; {len(self.untold)} of {len(self._laws)} laws have too few scenes or pairs to tell"
+        return f"nothing differs that draws do not explain{few if self.untold else ''}"
 
     @property
     def untold(self) -> tuple[str, ...]:
         """Laws of which there are too few draws for any difference to be told."""
-        return tuple(law.name for law in (*self.labels, *self.pixels) if not law.can_differ)
+        return tuple(law.name for law in self._laws if not law.can_differ)
+
+    @property
+    def _are_same(self) -> bool:
+        return self.same_frames == self.pairs[0] == self.pairs[1]
+
+    @property
+    def _laws(self) -> tuple[LawDiff, ...]:
+        return *self.labels, *self.pixels
 
 
 class _Drawn(NamedTuple):

@@ -89,7 +89,7 @@ def diff(
 
     The last line tells what differs more than draws of one law do.
 
-    Exits with 1 where labels or pixels differ.
+    Exits with 1 where labels or pixels differ, and where there are too few scenes or pairs to tell any difference.
     """
     from droguekit.assurance.dataset_diff import FALSE_ALARMS, diff_datasets, diff_lines
     from droguekit.visualization.diff_page import write_diff_page
@@ -101,7 +101,7 @@ def diff(
     if html is not None:
         write_diff_page(found, (a, b), html, FALSE_ALARMS)
         typer.echo(f"wrote {html}")
-    if found.differs:
+    if found.differs or not found.can_tell:
         raise typer.Exit(FAULT)
 
 
