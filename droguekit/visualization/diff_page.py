@@ -17,12 +17,31 @@ from droguekit.assurance.dataset_diff import DatasetDiff, KeyDiff
 from droguekit.assurance.law_comparison import LawDiff
 from droguekit.scoring.report.html_page import RowGroup, Table, page_template
 from droguekit.scoring.report.label_drawing import display_picture, resized
+from droguekit.scoring.report.number_text import percent
 
 _SHOWN_PAIRS, _TILE_PX, _JPEG_QUALITY = 4, 320, 80
-_BAR_PX, _HEIGHT_PX = 8, 48
-# Numbers have as many parts.
-_MOST_BARS = 24
-_BAR = Markup('<rect x="{}" y="{:.2f}" width="{}" height="{:.2f}" fill="var(--{})"><title>{}: {:.0f} %</title></rect>')
+_WIDTH_PX, _HEIGHT_PX = 192, 48
+# More words of a law are folded.
+_OPEN_WORDS = 6
+_BAR = Markup(
+    '<rect x="{:.2f}" y="{:.2f}" width="{:.2f}" height="{:.2f}" fill="var(--{})"><title>of this part: {}</title></rect>'
+)
+
+
+class _Word(NamedTuple):
+    """A word of a law: its shares as text, and the lengths of their bars. [%]"""
+
+    name: str
+    shares: tuple[str, str]
+    lengths: tuple[float, float]
+
+
+class _ShownLaw(NamedTuple):
+    """A law of numbers with a picture, or one of words with its words, the commonest first."""
+
+    law: LawDiff
+    bars: Markup
+    words: list[_Word]
 
 
 class _ShownPair(NamedTuple):
@@ -52,14 +71,20 @@ def write_diff_page(found: DatasetDiff, datasets: tuple[Location, Location], out
         groups=[("Labels", _shown(found.labels)), ("Pixels", _shown(found.pixels))],
         tables=[_key_table(title, anchor, keys) for title, anchor, keys in tables if keys],
         pictures=list(_pictures(datasets)),
+        open_words=_OPEN_WORDS,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text_atomic(out, page)
 
 
-def _shown(laws: tuple[LawDiff, ...]) -> list[tuple[LawDiff, Markup]]:
-    """Laws and their pictures; what differs comes first."""
-    return [(law, _bars(law)) for law in sorted(laws, key=lambda law: not law.differs)]
+def _shown(laws: tuple[LawDiff, ...]) -> list[_ShownLaw]:
+    """Laws in pictures; what differs comes first."""
+    shown = []
+    for law in sorted(laws, key=lambda law: not law.differs):
+        # Of numbers only the two ends of their range have names.
+        are_words = len(law.ends) == len(law.shares[0])
+        shown.append(_ShownLaw(law, *((Markup(), _words(law)) if are_words else (_bars(law), []))))
+    return shown
 
 
 def _key_table(title: str, anchor: str, keys: tuple[KeyDiff, ...]) -> Table:
@@ -71,19 +96,23 @@ def _key_table(title: str, anchor: str, keys: tuple[KeyDiff, ...]) -> Table:
 
 def _bars(law: LawDiff) -> Markup:
     """Two rows of bars as an SVG: shares of A upwards, of B downwards."""
-    most = max((*law.shares[0], *law.shares[1], 1e-9))
-    are_words = len(law.ends) == len(law.shares[0])
+    most, step = max((*law.shares[0], *law.shares[1], 1e-9)), _WIDTH_PX / len(law.shares[0])
     bars = []
     for place, pair in enumerate(zip(*law.shares, strict=True)):
-        if place == _MOST_BARS:
-            break
-        label = law.ends[place] if are_words else "of this part"
         for share, color in zip(pair, "ab", strict=True):
             length = share / most * _HEIGHT_PX / 2
             top = _HEIGHT_PX / 2 - (length if color == "a" else 0.0)
-            bars.append(_BAR.format(place * _BAR_PX, top, _BAR_PX - 1, length, color, label, 100 * share))
-    frame = Markup('<svg viewBox="0 0 {} {}" role="img" aria-label="shares">{}</svg>')
-    return frame.format(_MOST_BARS * _BAR_PX, _HEIGHT_PX, Markup("").join(bars))
+            bars.append(_BAR.format(place * step, top, step - 1, length, color, percent(share)))
+    frame = Markup('<svg viewBox="0 0 {} {}" role="img" aria-label="shares of A upwards, of B downwards">{}</svg>')
+    return frame.format(_WIDTH_PX, _HEIGHT_PX, Markup("").join(bars))
+
+
+def _words(law: LawDiff) -> list[_Word]:
+    words = zip(law.ends, *law.shares, strict=True)
+    return [
+        _Word(name, (percent(a), percent(b)), (100 * a, 100 * b))
+        for name, a, b in sorted(words, key=lambda word: -max(word[1:]))
+    ]
 
 
 def _pictures(datasets: tuple[Location, Location]) -> Iterator[_ShownPair]:
