@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import gammaincinv, ndtri
+from numpy.typing import NDArray
+from scipy.special import gammaincinv, ndtri, stdtrit
 
 from datasets_manifest.random_streams import named_generator
 from geometry.se3 import Array
@@ -13,6 +15,8 @@ from geometry.se3 import Array
 CONFIDENCE = 0.95
 RESAMPLES = 1000
 RATIO_RESAMPLES = 2000
+# Percentiles of resamples between which the interval lies.
+_ENDS = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
 
 # Numbers drawn in one go by the bootstrap: bounds its memory to some tens of megabytes.
 _DRAWS_AT_ONCE = 2_000_000
@@ -26,26 +30,59 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def rms_interval(values: Array) -> Interval:
-    """Confidence interval of the root mean square of independent errors about zero, by the chi-square law.
+def rms_interval(values: Array, blocks: Sequence[int]) -> Interval:
+    """Confidence interval of the root mean square of errors about zero, by the chi-square law.
 
-    The mean square of errors that do not follow one normal law, such as a mixture of distances or errors with outliers,
-    is less certain than their number suggests. The degrees of freedom match the measured variance of the squares, and
-    never exceed the number of errors.
+    The mean square of errors that do not follow one normal law, such as a mixture of distances, errors with outliers,
+    or errors that a sequence shares, is less certain than their number suggests. The degrees of freedom match the
+    measured variance of the mean square between blocks, and never exceed the number of blocks.
 
     Args:
         values: (n,) errors.
+        blocks: (n,) number of each error's block; errors of a block are not independent.
 
-    Source: n s^2 / sigma^2 ~ chi-square(n); degrees of freedom 2 n m2^2 / (m4 - m2^2), matching the second moment.
+    Source: n s^2 / sigma^2 ~ chi-square(n); degrees of freedom 2 m2^2 / var(m2), matching the second moment.
     """
     squares = np.square(values)
     mean = float(squares.mean())
     if mean == 0.0:
         return 0.0, 0.0
-    spread = float(squares.var())
-    freedom = len(values) if spread == 0.0 else min(float(len(values)), 2 * len(values) * mean**2 / spread)
+    place, count = _places(blocks)
+    variance = float(np.square(np.bincount(place, squares - mean)).sum()) / len(values) ** 2
+    freedom = float(count) if variance == 0.0 else min(float(count), 2 * mean**2 / variance)
     low, high = (freedom * mean / _chi2_quantile(p, freedom) for p in ((1 + CONFIDENCE) / 2, (1 - CONFIDENCE) / 2))
     return float(np.sqrt(low)), float(np.sqrt(high))
+
+
+def mean_interval(values: Array, blocks: Sequence[int], limits: Interval = (-math.inf, math.inf)) -> Interval | None:
+    """Confidence interval of a mean by the jackknife over blocks and Student's law.
+
+    Args:
+        values: (n,).
+        blocks: (n,) number of each value's block; values of a block are not independent.
+        limits: that no mean can pass, such as 0 and 1 of shares.
+
+    Returns:
+        None with fewer than two blocks, whose scatter cannot be estimated.
+
+    Source: R. G. Miller, Biometrika 61 (1974) 1, doi:10.1093/biomet/61.1.1; one degree of freedom less than there are
+    blocks. With single values as blocks it is Student's interval.
+    """
+    place, count = _places(blocks)
+    if count < 2:
+        return None
+    mean, sizes = float(values.mean()), np.bincount(place)
+    # How far the mean moves without each block.
+    moves = np.bincount(place, values - mean) / (len(values) - sizes)
+    deviation = np.sqrt(float(np.square(moves).sum()) * (count - 1) / count)
+    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2) * deviation)
+    return max(mean - half, limits[0]), min(mean + half, limits[1])
+
+
+def _places(blocks: Sequence[int]) -> tuple[NDArray[np.intp], int]:
+    """The place of each block among all different ones, and how many those are."""
+    _, place = np.unique(np.asarray(blocks, dtype=np.int64), return_inverse=True)
+    return place, int(place.max(initial=-1)) + 1
 
 
 def _chi2_quantile(share: float, freedom: float) -> float:
@@ -80,34 +117,53 @@ def fraction_interval(hits: int, count: int) -> Interval:
     return (float(middle - half) if hits else 0.0), (float(middle + half) if hits < count else 1.0)
 
 
-def bootstrap_intervals(columns: Array, percentiles: tuple[float, ...], key: str) -> tuple[Array, Array]:
-    """Percentile-bootstrap intervals of means and percentiles, all from the same resampled frames.
+def percentile_intervals(
+    columns: Array, percentiles: tuple[float, ...], blocks: Sequence[int], key: str
+) -> Array | None:
+    """Percentile-bootstrap intervals of percentiles of absolute values.
 
     With few frames the upper end of a high percentile cannot pass the largest error that was seen.
 
     Args:
         columns: (n, C) one row a frame; the result does not depend on the rows' order.
         percentiles: which, in percent.
+        blocks: (n,) number of each frame's block; frames of a block are not independent and are drawn together.
         key: of the random stream.
 
     Returns:
-        (C, 2) intervals of the means of `columns`, (C, P, 2) intervals of the percentiles of their absolute values.
+        (C, P, 2), or None with fewer than two blocks.
 
     Source: B. Efron, Ann. Statist. 7 (1979) 1, doi:10.1214/aos/1176344552.
     """
-    ordered = columns[np.lexsort(columns.T)]
-    size = len(ordered)
-    rng = named_generator(key)
-    means, ranks = [], []
-    step = max(1, _DRAWS_AT_ONCE // (size * columns.shape[1]))
+    place, count = _places(blocks)
+    if count < 2:
+        return None
+    sizes, rng, found = np.abs(columns), named_generator(key), []
+    step = max(1, _DRAWS_AT_ONCE // len(sizes))
     for start in range(0, RESAMPLES, step):
-        drawn = ordered[rng.integers(0, size, (min(step, RESAMPLES - start), size))]
-        means.append(drawn.mean(axis=1))
-        ranks.append(np.percentile(np.abs(drawn), percentiles, axis=1))
-    ends = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
-    mean_ends = np.percentile(np.concatenate(means), ends, axis=0)
-    rank_ends = np.percentile(np.concatenate(ranks, axis=1), ends, axis=1)
-    return mean_ends.T, rank_ends.transpose(2, 1, 0)
+        drawn = rng.integers(0, count, (min(step, RESAMPLES - start), count))
+        of_row = drawn + count * np.arange(len(drawn))[:, None]
+        times = np.bincount(of_row.ravel(), minlength=drawn.size).reshape(drawn.shape)
+        found.append([_weighted_percentiles(column, times[:, place], percentiles) for column in sizes.T])
+    return np.percentile(np.concatenate(found, axis=2), _ENDS, axis=2).transpose(1, 2, 0)
+
+
+def _weighted_percentiles(values: Array, times: NDArray[np.int64], percentiles: tuple[float, ...]) -> Array:
+    """(P, R) percentiles, as numpy's, of R samples that hold each of (n,) values as often as (R, n) `times` says."""
+    order = np.argsort(values)
+    values, reached = values[order], np.cumsum(times[:, order], axis=1)
+
+    def at(rank: Array) -> Array:
+        """(R,) value of a rank in each sample."""
+        found: Array = values[(reached <= rank[:, None]).sum(axis=1)]
+        return found
+
+    rows = []
+    for percent in percentiles:
+        rank = (reached[:, -1] - 1) * percent / 100
+        low, high = at(np.floor(rank)), at(np.ceil(rank))
+        rows.append(low + (high - low) * (rank - np.floor(rank)))
+    return np.array(rows)
 
 
 def ratio_intervals(numerators: Array, denominators: Array, blocks: Sequence[int], key: str) -> list[Interval | None]:
@@ -121,10 +177,9 @@ def ratio_intervals(numerators: Array, denominators: Array, blocks: Sequence[int
     Returns:
         For each of the C columns; None with fewer than two blocks, or where a resampled denominator is zero.
 
-    Source: as `bootstrap_intervals`; 2000 resamples.
+    Source: as `percentile_intervals`; 2000 resamples.
     """
-    _, place = np.unique(np.asarray(blocks), return_inverse=True)
-    count = int(place.max(initial=-1)) + 1
+    place, count = _places(blocks)
     columns = numerators.shape[1]
     if count < 2:
         return [None] * columns
@@ -143,7 +198,7 @@ def ratio_intervals(numerators: Array, denominators: Array, blocks: Sequence[int
 def _ratio_ends(above: Array, below: Array) -> Interval | None:
     if not below.all():
         return None
-    low, high = np.percentile(above / below, (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)))
+    low, high = np.percentile(above / below, _ENDS)
     return float(low), float(high)
 
 
@@ -154,17 +209,3 @@ def rate_interval(count: int, exposure: float) -> Interval:
     """
     low = float(_chi2_quantile((1 - CONFIDENCE) / 2, 2 * count)) / 2 if count else 0.0
     return low / exposure, float(_chi2_quantile((1 + CONFIDENCE) / 2, 2 * count + 2)) / 2 / exposure
-
-
-def mean_interval(values: Array, blocks: Sequence[int], key: str) -> Interval | None:
-    """Bootstrap interval of a mean; values of a block are drawn together.
-
-    Args:
-        values: (n,).
-        blocks: (n,) number of each value's block.
-        key: of the random stream.
-
-    Returns:
-        None with fewer than two blocks, whose scatter cannot be estimated.
-    """
-    return ratio_intervals(values[:, None], np.ones((len(values), 1)), blocks, key)[0]

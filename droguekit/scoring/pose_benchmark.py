@@ -162,7 +162,7 @@ def score_sequences(
         parts = {
             "tracking": score_regions(sequences, estimates) if has_regions else None,
             "filtering": filter_errors(data, name, methods),
-            "docking": docking_errors(data, dockings, estimates, f"{name}, docking"),
+            "docking": docking_errors(data, dockings, estimates),
             "latency": latency(data, estimates),
         }
         if any(part is not None for part in parts.values()):

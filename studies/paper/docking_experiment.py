@@ -6,6 +6,7 @@ Pictures show the frames with the largest errors of a method: its measurements, 
 from __future__ import annotations
 
 import html
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
 from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
 from drogue_models.marker_layout import MarkerLayout, marker_layout
-from droguekit.scoring.confidence_intervals import Interval, bootstrap_intervals
+from droguekit.scoring.confidence_intervals import Interval, mean_interval
 from droguekit.scoring.pose_benchmark import score_methods
 from droguekit.scoring.poses.drogue_truth import VISIBLE_FRACTION, drogue_truth
 from droguekit.scoring.poses.pose_errors import pose_error
@@ -155,24 +156,22 @@ def read_docking(dataset: Location, estimates: Path, faults: PairFaults | None =
     return DockingData(data, file, shown, first_frames, result)
 
 
-def subset_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) -> SubsetScores:
+def subset_scores(errors: Mapping[int, Array], frames: Sequence[int]) -> SubsetScores:
     """Scores over some pairs, of which there is at least one.
 
     Args:
         errors: (5,) X, Y, Z [m], pitch, yaw [deg] by frame, where there is a pose.
         frames: which pairs count.
-        key: of the bootstrap's random stream.
     """
     rows = np.array([errors[index] for index in frames if index in errors])
     if not len(rows):
         return SubsetScores(0.0)
     lengths = np.linalg.norm(rows[:, :3], axis=1)
-    means, _ = bootstrap_intervals(lengths[:, None], (99.0,), key)
     sizes = np.abs(rows)
     return SubsetScores(
         fix_fraction=len(rows) / len(frames),
         mean_m=float(lengths.mean()),
-        interval_m=(float(means[0, 0]), float(means[0, 1])),
+        interval_m=mean_interval(lengths, range(len(lengths)), (0.0, math.inf)),
         p99_m=float(np.percentile(lengths, 99.0)),
         largest_m=sizes[:, :3].max(axis=0),
         angles_p99_deg=np.percentile(sizes[:, 3:], 99.0, axis=0),

@@ -199,7 +199,7 @@ def _docking_cells(contender: Contender, method: MethodResult) -> list[str]:
 
 
 def _chosen_cells(docking: DockingData, contender: Contender, frames: Sequence[int]) -> list[str]:
-    scores = subset_scores(docking.pose_errors(contender.method), frames, f"in view, {contender.method}")
+    scores = subset_scores(docking.pose_errors(contender.method), frames)
     largest = [None] * 3 if scores.largest_m is None else scores.largest_m.tolist()
     angles = [None] * 2 if scores.angles_p99_deg is None else scores.angles_p99_deg.tolist()
     return [

@@ -16,6 +16,7 @@ from droguekit.scoring.pose_benchmark import run_benchmark, score_methods
 from droguekit.scoring.poses.centroid_errors import centroid_errors
 from droguekit.scoring.poses.drogue_truth import drogue_truth
 from droguekit.scoring.poses.pose_errors import estimates_by_method
+from droguekit.scoring.report.pose_report import result_sentences
 from droguekit.scoring.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform, exp_twist
 
@@ -219,6 +220,37 @@ def test_missing_and_refused_frames_count_as_not_fixed(build: SimpleNamespace, r
     assert method.bins[1].bound_ratio is None
     low, high = method.overall.intervals["fix_fraction"]
     assert low < 3 / 8 < high
+
+
+def test_a_single_pose_has_no_interval_of_its_mean(build: SimpleNamespace, rng: np.random.Generator) -> None:
+    records = build.records([3.0], 4, rng)
+    moved = shifted(records[0].left_from_drogue, (0.0, 0.0, 1e-3))
+    result = score_records(records, [build.estimate(records[0].frame_index, moved)])
+    row = result.methods["joint"].overall
+    assert row.position_mean_m == pytest.approx(1e-3)
+    assert not any(key.split("_")[1] in ("mean", "bias", "p95", "p99") for key in row.intervals)
+    # The chi-square law with one degree of freedom: 2.5 % of squares are below 0.000982, 97.5 % below 5.0239.
+    assert row.intervals["z_rmse_m"] == pytest.approx((1e-3 / 5.0239**0.5, 1e-3 / 0.000982069**0.5), rel=1e-4)
+    told = " ".join(result_sentences(result))
+    assert "its mean position error is 1.00 mm, and it found a pose in 25 % of the pairs" in told
+
+
+def test_pairs_of_a_sequence_count_once(build: SimpleNamespace, rng: np.random.Generator) -> None:
+    """Each flight has an offset of its own: a hundred pairs of three flights know the mean no better than three."""
+    records = [r for s in range(3) for r in build.sequence(build.swinging, 30, sequence_id=s)]
+    offsets_m = [1e-3, 2e-3, 3e-3]
+    estimates = [
+        build.estimate(r.frame_index, shifted(r.left_from_drogue, (offsets_m[r.sequence_id], 0.0, 0.0)))
+        for r in records
+    ]
+    row = score_records(records, estimates).methods["joint"].overall
+    # 97.5 % of Student's law with two degrees of freedom lie below 4.30265; the offsets' deviation is 1 mm.
+    half_m = 4.30265e-3 / 3**0.5
+    assert row.intervals["x_bias_m"] == pytest.approx((2e-3 - half_m, 2e-3 + half_m), rel=1e-4)
+    assert row.intervals["position_mean_m"] == pytest.approx((0.0, 2e-3 + half_m), rel=1e-4)
+    # Three degrees of freedom at most.
+    low, high = row.intervals["x_rmse_m"]
+    assert high / low > 4
 
 
 def test_a_pose_where_there_is_no_drogue_is_a_false_one(build: SimpleNamespace, rng: np.random.Generator) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from droguekit.scoring.confidence_intervals import (
     Interval,
-    bootstrap_intervals,
     fraction_interval,
+    mean_interval,
+    percentile_intervals,
     ratio_intervals,
     rms_interval,
     root_mean_square,
@@ -78,16 +80,23 @@ class FrameScore:
     """Scores of one method in one pair that shows a drogue.
 
     Attributes:
+        block: see `block_of_pair`.
         pose: scores of its pose, or None without one.
         bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
         centroids: errors of its features.
         from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
     """
 
+    block: int
     pose: PoseScore | None
     bound: Array | None
     centroids: CentroidErrors
     from_centroids_m: Array | None
+
+
+def block_of_pair(index: int, sequence_id: int | None) -> int:
+    """What a pair's errors depend on each other in: its sequence, or itself; the sign keeps the two apart."""
+    return -1 - index if sequence_id is None else sequence_id
 
 
 def frame_scores(
@@ -116,6 +125,7 @@ def frame_scores(
             own_noise = noise[reference.bin_of_frame[index]]
             pose = _pose_score(estimate, truth, found, own_noise, reference.covariances[index])
         scores[index] = FrameScore(
+            block=block_of_pair(index, truth.sequence_id),
             pose=pose,
             bound=reference.bounds[index],
             centroids=found,
@@ -139,7 +149,7 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Po
     bound = mean_bound([score.bound for score in fixed])
     bounded = [score.pose.error for score in fixed if score.pose is not None and score.bound is not None]
     if poses:
-        numbers, error_intervals = _error_numbers([pose.error for pose in poses], key)
+        numbers, error_intervals = _error_numbers([pose.error for pose in poses], [score.block for score in fixed], key)
         intervals |= error_intervals
     return PoseRow.model_validate(
         {
@@ -200,28 +210,33 @@ def _used_noise(errors: Sequence[CentroidErrors]) -> FeatureNoise | None:
     return feature_noise(marker_px, hub_px)
 
 
-def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:
+def _error_numbers(
+    errors: Sequence[PoseError], blocks: Sequence[int], key: str
+) -> tuple[dict[str, float], dict[str, Interval]]:
     position = np.array([error.position_m for error in errors])
     columns = np.column_stack([position, np.stack([error.components for error in errors])])
     names = [("position", "m"), *UNITS.items()]
-    mean_ends, rank_ends = bootstrap_intervals(columns, _PERCENTILES, key)
+    rank_ends = percentile_intervals(columns, _PERCENTILES, blocks, key)
     numbers: dict[str, float] = {}
     intervals: dict[str, Interval] = {}
     for k, (name, unit) in enumerate(names):
-        column = columns[:, k]
-        average = f"{name}_mean_{unit}" if name == "position" else f"{name}_bias_{unit}"
+        column, is_length = columns[:, k], name == "position"
+        average = f"{name}_mean_{unit}" if is_length else f"{name}_bias_{unit}"
         numbers[average] = float(column.mean())
-        intervals[average] = tuple(mean_ends[k].tolist())
+        mean_ends = mean_interval(column, blocks, (0.0 if is_length else -math.inf, math.inf))
+        if mean_ends is not None:
+            intervals[average] = mean_ends
         numbers[f"{name}_rmse_{unit}"] = root_mean_square(column)
-        intervals[f"{name}_rmse_{unit}"] = rms_interval(column)
+        intervals[f"{name}_rmse_{unit}"] = rms_interval(column, blocks)
         for p, percent in enumerate(_PERCENTILES):
             rank = f"{name}_p{percent:.0f}_{unit}"
             numbers[rank] = float(np.percentile(np.abs(column), percent))
-            intervals[rank] = tuple(rank_ends[k, p].tolist())
+            if rank_ends is not None:
+                intervals[rank] = tuple(rank_ends[k, p].tolist())
         numbers[f"{name}_max_{unit}"] = float(np.abs(column).max())
     transverse = np.array([error.transverse_m for error in errors])
     numbers["transverse_rmse_m"] = root_mean_square(transverse)
-    intervals["transverse_rmse_m"] = rms_interval(transverse)
+    intervals["transverse_rmse_m"] = rms_interval(transverse, blocks)
     return numbers, intervals
 
 
@@ -317,9 +332,7 @@ def _comparison(name: str, other: str, errors: Errors, groups: PairGroups) -> Me
     common = sorted(errors[name].keys() & errors[other].keys())
     above, below = (_sizes([errors[method][i] for i in common]) for method in (name, other))
     bins = np.array([groups.bin_of_frame[i] for i in common], dtype=np.intp)
-    # Single pairs are blocks of their own; their sign separates them from sequences.
-    sequences = [groups.sequence_of_frame[i] for i in common]
-    blocks = np.array([-1 - i if s is None else s for i, s in zip(common, sequences, strict=True)], dtype=np.int64)
+    blocks = np.array([block_of_pair(i, groups.sequence_of_frame[i]) for i in common], dtype=np.int64)
     rows = []
     for k, place in enumerate(groups.bins):
         inside = bins == k

@@ -371,10 +371,11 @@ def result_sentences(result: BenchmarkResult) -> list[str]:
     if best is None:
         return [f"None of the methods found a pose in any of the {shown} pairs, from {low} to {high} m."]
     method = result.methods[best]
-    ends = interval_text(method.overall.intervals["position_mean_m"], 1e3)
+    ends = method.overall.intervals.get("position_mean_m")
+    within = "" if ends is None else f" (95 % interval {interval_text(ends, 1e3)} mm)"
     sentences = [
         f"Over {shown} stereo pairs from {low} to {high} m, {best} came closest to the truth: its mean position error "
-        f"is {millimetres(method.overall.position_mean_m)} mm (95 % interval {ends} mm), and it found a pose in "
+        f"is {millimetres(method.overall.position_mean_m)} mm{within}, and it found a pose in "
         f"{percent(method.overall.fix_fraction)} of the pairs."
     ]
     fixed = [row for row in method.bins if row.fixes]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -77,7 +78,7 @@ class DockingPair(NamedTuple):
 
 
 def docking_errors(
-    data: SequenceData, truth: Mapping[int, TrueDocking], estimates: Mapping[int, Estimate], key: str
+    data: SequenceData, truth: Mapping[int, TrueDocking], estimates: Mapping[int, Estimate]
 ) -> DockingErrors | None:
     """The scores of a method; None where it reports no docking quantities.
 
@@ -85,7 +86,6 @@ def docking_errors(
         data: the truth of the sequences.
         truth: of docking, by frame.
         estimates: of the method, by frame.
-        key: of the bootstrap's random streams.
     """
     pairs = [
         DockingPair(index, estimate.docking, truth[index])
@@ -98,9 +98,9 @@ def docking_errors(
     for k, place in enumerate(data.groups.bins):
         inside = [pair for pair in pairs if bin_of[pair.frame_index] == k]
         if inside:
-            row = _row(data, inside, sum(bin_of[index] == k for index in truth), f"{key}, bin {k}")
+            row = _row(data, inside, sum(bin_of[index] == k for index in truth))
             bins.append(DockingBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
-    return DockingErrors(overall=_row(data, pairs, len(truth), key), bins=tuple(bins))
+    return DockingErrors(overall=_row(data, pairs, len(truth)), bins=tuple(bins))
 
 
 def true_dockings(sequences: Sequence[TrueSequence], motions: Mapping[int, TrueMotion]) -> dict[int, TrueDocking]:
@@ -182,11 +182,11 @@ def calibration(errors: Array, deviations: Array) -> Calibration | None:
     return Calibration(n=int(known.sum()), within_1=float(np.mean(ratios <= 1)), within_2=float(np.mean(ratios <= 2)))
 
 
-def _row(data: SequenceData, pairs: Sequence[DockingPair], of: int, key: str) -> DockingRow:
+def _row(data: SequenceData, pairs: Sequence[DockingPair], of: int) -> DockingRow:
     errors = np.array([pair.reported.mouth_from_tip_m - pair.true.mouth_from_tip_m for pair in pairs])
     deviations = np.array([pair.reported.mouth_sd_m for pair in pairs])
     squares = np.square(errors).sum(axis=1)
-    ends = mean_interval(squares, [data.sequence_of(pair.frame_index) for pair in pairs], f"{key}, mouth")
+    ends = mean_interval(squares, [data.sequence_of(pair.frame_index) for pair in pairs], (0.0, math.inf))
     closures = np.array(
         [
             pair.reported.closure_m_s - pair.true.closure_m_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -81,12 +82,12 @@ def filter_errors(data: SequenceData, name: str, methods: Mapping[str, Mapping[i
         inside = [score for score in scores if data.groups.bin_of_frame[score.frame_index] == k]
         if inside:
             of = sum(data.groups.bin_of_frame[index] == k for index in data.motions)
-            row = _motion_row(data, inside, of, f"{name}, bin {k}")
+            row = _motion_row(data, inside, of)
             bins.append(MotionBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
     return FilterErrors(
-        motion=_motion_row(data, scores, len(data.motions), name) if scores else None,
+        motion=_motion_row(data, scores, len(data.motions)) if scores else None,
         bins=tuple(bins),
-        nees=_motion_nees(data, scores, name) if scores else None,
+        nees=_motion_nees(data, scores) if scores else None,
         lags=lags(data.sequences, estimates, f"{name}, lag"),
         raw=_against_raw(data, name, methods),
     )
@@ -182,13 +183,13 @@ def _motion_scores(data: SequenceData, estimates: Mapping[int, PoseEstimate]) ->
     return scores
 
 
-def _motion_row(data: SequenceData, scores: Sequence[_MotionScore], of: int, key: str) -> MotionRow:
+def _motion_row(data: SequenceData, scores: Sequence[_MotionScore], of: int) -> MotionRow:
     errors = np.array([score.error for score in scores])
     errors[:, 3:] = np.rad2deg(errors[:, 3:])
     blocks = [data.sequence_of(score.frame_index) for score in scores]
     rms = np.sqrt(np.square(errors).mean(axis=0)).tolist()
     squares = {part: np.square(errors[:, MOTION_PARTS[part]]).sum(axis=1) for part in ("velocity", "rate")}
-    ends = {part: mean_interval(values, blocks, f"{key}, {part}") for part, values in squares.items()}
+    ends = {part: mean_interval(values, blocks, (0.0, math.inf)) for part, values in squares.items()}
     roots = {part: None if e is None else (float(np.sqrt(e[0])), float(np.sqrt(e[1]))) for part, e in ends.items()}
     return MotionRow(
         n=len(scores),
@@ -202,14 +203,14 @@ def _motion_row(data: SequenceData, scores: Sequence[_MotionScore], of: int, key
     )
 
 
-def _motion_nees(data: SequenceData, scores: Sequence[_MotionScore], key: str) -> MotionNees:
+def _motion_nees(data: SequenceData, scores: Sequence[_MotionScore]) -> MotionNees:
     usable = [(data.sequence_of(score.frame_index), score.squares) for score in scores if score.squares is not None]
     squares = np.array([row for _, row in usable])
     parts = nees_parts(squares, MOTION_PARTS)
     interval = None
     if usable:
         per_freedom = squares[:, 2] / parts["motion"].freedom
-        interval = mean_interval(per_freedom, [block for block, _ in usable], f"{key}, motion nees")
+        interval = mean_interval(per_freedom, [block for block, _ in usable], (0.0, math.inf))
     return MotionNees(
         n=len(usable),
         unusable=len(scores) - len(usable),

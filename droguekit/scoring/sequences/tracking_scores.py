@@ -135,21 +135,19 @@ def eye_tracks(
     return {eye: [_eye_track(sequence, eye, boxes) for sequence in sequences] for eye in EYES}
 
 
-def eye_tracking(tracks: Sequence[EyeTrack], key: str) -> EyeTracking:
-    """The scores of one eye's images; `key` is that of the bootstrap's random stream."""
-    return _track_scores(tracks, _losses(tracks), key)
+def eye_tracking(tracks: Sequence[EyeTrack]) -> EyeTracking:
+    """The scores of one eye's images."""
+    return _track_scores(tracks, _losses(tracks))
 
 
 def both_eyes_tracking(by_eye: Mapping[Eye, Sequence[EyeTrack]]) -> EyeTracking:
     """The scores of both eyes' images; losses are those of the eye that has more."""
     losses = [found for found in map(_losses, by_eye.values()) if found is not None]
     worse = max(losses, key=lambda found: (found.count, found.per_minute), default=None)
-    return _track_scores([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
+    return _track_scores([track for eye in EYES for track in by_eye[eye]], worse)
 
 
-def overlap_row(
-    tracks: Sequence[EyeTrack], chosen: Callable[[EyeTrack], NDArray[np.bool_]], key: str
-) -> OverlapRow | None:
+def overlap_row(tracks: Sequence[EyeTrack], chosen: Callable[[EyeTrack], NDArray[np.bool_]]) -> OverlapRow | None:
     """The OTB scores of the chosen images of each track; None where there are none."""
     picks = [chosen(track) for track in tracks]
     found, truth = (
@@ -168,10 +166,10 @@ def overlap_row(
     return OverlapRow(
         n=len(found),
         auc=float(success.mean()),
-        auc_interval=mean_interval(areas, blocks, f"{key}, auc"),
+        auc_interval=mean_interval(areas, blocks, (0.0, 1.0)),
         mean_overlap=float(overlap.mean()),
         precision=float(near.mean()),
-        precision_interval=mean_interval(near.astype(np.float64), blocks, f"{key}, precision"),
+        precision_interval=mean_interval(near.astype(np.float64), blocks, (0.0, 1.0)),
         normalized_precision=float(normalized.mean()),
         center_rms_px=root_mean_square(errors[known]) if known.any() else None,
         success=tuple(success.tolist()),
@@ -232,12 +230,12 @@ def _shares(passed: NDArray[np.bool_]) -> Array:
     return shares
 
 
-def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None, key: str) -> EyeTracking:
+def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None) -> EyeTracking:
     boxed = [box is not None for track in tracks for box in track.sources]
     hidden = [visibility == "hidden" for track in tracks for visibility in track.visibilities]
     found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]
     return EyeTracking(
-        overlap=overlap_row(tracks, lambda track: track.seen, key),
+        overlap=overlap_row(tracks, lambda track: track.seen),
         losses=losses,
         reacquisition=reacquisition((track.visibilities, hits) for track, hits in zip(tracks, found, strict=True)),
         hidden=sum(hidden),
@@ -320,7 +318,7 @@ def _tracking(sequences: Sequence[TrueSequence], boxes: Boxes, stages_s: StageTi
     sources = sorted({box.source for box in boxes.values() if box.source})
     return Tracking(
         both=both_eyes_tracking(by_eye),
-        eyes={eye: eye_tracking(by_eye[eye], f"eye {eye}") for eye in EYES},
+        eyes={eye: eye_tracking(by_eye[eye]) for eye in EYES},
         sources={source: _source_tracking(source, tracks, stages_s) for source in sources},
     )
 
@@ -340,7 +338,7 @@ def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTim
         if _BOX_STAGES & stages.keys()
     ]
     return SourceTracking(
-        overlap=overlap_row(tracks, lambda track: is_own(track) & track.seen, f"source {source}"),
+        overlap=overlap_row(tracks, lambda track: is_own(track) & track.seen),
         pairs=len(pairs),
         box_ms=float(np.median(box_ms)) if box_ms else None,
         frame_ms=float(np.median(times_ms)) if times_ms else None,

@@ -114,7 +114,7 @@ def test_answers_from_the_true_motion_err_by_what_was_put_in(build: SimpleNamesp
         forward, right, down = docking.mouth_from_tip_m
         moved = docking.model_copy(update={"mouth_from_tip_m": (forward, right + 0.005, down)})
         estimates[index] = told.model_copy(update={"docking": moved})
-    result = docking_errors(data, true_dockings(sequences, data.motions), estimates, "test")
+    result = docking_errors(data, true_dockings(sequences, data.motions), estimates)
     assert result is not None
     row = result.overall
     assert row.n == 60
@@ -145,7 +145,7 @@ def test_wrong_captures_are_told_apart(build: SimpleNamespace) -> None:
         )
         told = PoseEstimate(frame_index=k, method="m", left_from_drogue=record.left_from_drogue, docking=docking)
         estimates[k] = told
-    result = docking_errors(data, true_dockings(sequences, data.motions), estimates, "test")
+    result = docking_errors(data, true_dockings(sequences, data.motions), estimates)
     assert result is not None and result.overall.captures is not None and result.overall.miss is not None
     found = result.overall.captures
     # The true miss, 3 cm, is a capture; pairs 4 to 39 have a true motion.
@@ -173,7 +173,7 @@ def captures_of(build: SimpleNamespace, told: Callable[[int], dict[str, object]]
         )
         for k, record in enumerate(records)
     }
-    result = docking_errors(data, true_dockings(sequences, data.motions), estimates, "test")
+    result = docking_errors(data, true_dockings(sequences, data.motions), estimates)
     assert result is not None and result.overall.captures is not None
     return result.overall.captures
 
@@ -221,4 +221,4 @@ def test_methods_without_docking_have_none(build: SimpleNamespace) -> None:
     records, sequences = straight(build)
     data = data_of(records, sequences)
     plain = {0: PoseEstimate(frame_index=0, method="m", left_from_drogue=records[0].left_from_drogue)}
-    assert docking_errors(data, true_dockings(sequences, data.motions), plain, "test") is None
+    assert docking_errors(data, true_dockings(sequences, data.motions), plain) is None

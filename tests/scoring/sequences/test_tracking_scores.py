@@ -247,10 +247,9 @@ def test_intervals_are_of_whole_sequences(build: SimpleNamespace) -> None:
     low, high = result.both.overlap.precision_interval or (0.0, 0.0)
     values = 1 - np.arange(6) / 10
     assert result.both.overlap.precision == pytest.approx(values.mean())
-    # Two standard errors of six values; the bootstrap of so few is a little narrower.
-    spread = 2 * values.std() / np.sqrt(6)
-    assert high - low == pytest.approx(2 * spread, rel=0.15)
-    assert low < values.mean() < high
+    # Student's interval of six values: 97.5 % lie below 2.5706 at five degrees of freedom; no share is above 1.
+    assert low == pytest.approx(values.mean() - 2.5706 * values.std(ddof=1) / np.sqrt(6), abs=1e-5)
+    assert values.mean() < high <= 1
 
 
 def test_the_ends_of_a_rate_leave_one_in_forty_on_each_side() -> None:

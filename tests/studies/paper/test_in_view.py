@@ -44,16 +44,18 @@ def test_pairs_are_chosen_by_what_both_eyes_see(record: PairRecord) -> None:
 def test_scores_are_those_of_the_chosen_pairs() -> None:
     errors = {k: np.array([0.003 * (k + 1), 0.004 * (k + 1), 0.0, 0.1 * k, -0.2]) for k in range(4)}
     errors[9] = np.full(5, 100.0)
-    scores = subset_scores(errors, [0, 1, 2, 3, 7], "test")
+    scores = subset_scores(errors, [0, 1, 2, 3, 7])
     # 3, 4, 5: the lengths are 5, 10, 15 and 20 mm; pair 7 has no pose and pair 9 does not count.
     assert scores.mean_m == pytest.approx(0.0125)
     assert scores.fix_fraction == pytest.approx(0.8)
-    assert scores.interval_m is not None and 0.005 <= scores.interval_m[0] < 0.0125 < scores.interval_m[1] <= 0.02
+    # Student's interval of four values: 97.5 % lie below 3.18245 at three degrees of freedom.
+    half_m = 3.18245 * np.std([0.005, 0.010, 0.015, 0.020], ddof=1) / 2
+    assert scores.interval_m == pytest.approx((0.0125 - half_m, 0.0125 + half_m), rel=1e-5)
     assert scores.largest_m is not None and scores.angles_p99_deg is not None
     np.testing.assert_allclose(scores.largest_m, [0.012, 0.016, 0])
     assert scores.angles_p99_deg[1] == pytest.approx(0.2)
 
 
 def test_without_a_pose_there_is_nothing_to_tell() -> None:
-    scores = subset_scores({}, [1, 2], "test")
+    scores = subset_scores({}, [1, 2])
     assert (scores.fix_fraction, scores.mean_m, scores.largest_m) == (0.0, None, None)
