@@ -12,10 +12,12 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator, PercentF
 from matplotlib.transforms import Bbox
 
 from droguekit.scoring.detection.detection_metrics import AT_50, Matches, precision_recall
+from droguekit.scoring.detection.detection_scores import ScoredDetections
 from droguekit.scoring.detection.detection_tables import PUBLISHED_DETECTORS
+from droguekit.scoring.detection.detection_truth import ImageTruth
 from droguekit.scoring.report.figures import INK, PANEL_IN, MethodStyle, drawing, method_styles, svg_element
 from droguekit.scoring.report.number_text import plain_number
-from droguekit.scoring.results.detection_result import DetectionResult, DetectorResult, DistanceRow
+from droguekit.scoring.results.detection_result import DetectionResult, DistanceRow
 from geometry.se3 import Array
 
 Measure = Literal["ap50", "ap", "recall"]
@@ -29,18 +31,20 @@ _BAR_COUNT = 25
 _TRUE_COLOR, _FALSE_COLOR = "#12946a", "#d03a3a"
 
 
-def distance_panel(result: DetectionResult, measure: Measure) -> str:
-    """One measure of every detector against distance, with its interval.
+def distance_panel(scored: ScoredDetections, measure: Measure) -> str:
+    """One measure of every detector against distance, with its interval; see `bin_distance_m` for a bin's place.
 
     Returns:
         An `<svg>` element.
     """
     with drawing(PANEL_IN) as (figure, axes):
-        names = list(result.detectors)
+        detectors = scored.result.detectors
+        names = list(detectors)
         styles = method_styles(names)
         step = min(1.03, 1.25 ** (1 / len(names)))
         for k, name in enumerate(names):
-            _draw_line(axes, result.detectors[name], measure, styles[name], step ** (k - (len(names) - 1) / 2))
+            rows = [(bin_distance_m(row, scored.images), row) for row in detectors[name].distances]
+            _draw_line(axes, rows, measure, styles[name], step ** (k - (len(names) - 1) / 2))
         axes.set_xscale("log")
         axes.set_xlabel("Distance [m]")
         axes.xaxis.set_major_locator(FixedLocator([2, 5, 10, 20, 40]))
@@ -156,14 +160,24 @@ def _draw_bars(axes: Axes, bars: _Bars, heaps: tuple[Array, Array]) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _draw_line(axes: Axes, detector: DetectorResult, measure: Measure, style: MethodStyle, shift: float) -> None:
-    rows = [(row, value) for row in detector.distances if (value := getattr(row, measure)) is not None]
-    if not rows:
+def bin_distance_m(row: DistanceRow, images: Sequence[ImageTruth]) -> float:
+    """Geometric mean of the distances of a bin's images, of which there is at least one. [m]"""
+    high_m = np.inf if row.high_m is None else row.high_m
+    distances_m = [image.distance_m for image in images if image.distance_m is not None]
+    return float(np.exp(np.mean([np.log(each) for each in distances_m if row.low_m <= each < high_m])))
+
+
+def _draw_line(
+    axes: Axes, rows: Sequence[tuple[float, DistanceRow]], measure: Measure, style: MethodStyle, shift: float
+) -> None:
+    """One detector's line; `rows` go with their distances."""
+    known = [(place_m, row, value) for place_m, row in rows if (value := getattr(row, measure)) is not None]
+    if not known:
         return
-    y = np.array([value for _, value in rows])
-    bars = np.array([_reach(row, measure, value) for row, value in rows]).T
+    y = np.array([value for _, _, value in known])
+    bars = np.array([_reach(row, measure, value) for _, row, value in known]).T
     axes.errorbar(
-        [_middle_m(row) * shift for row, _ in rows],
+        [place_m * shift for place_m, _, _ in known],
         y,
         yerr=bars,
         color=style.color,
@@ -179,13 +193,6 @@ def _reach(row: DistanceRow, measure: Measure, value: float) -> tuple[float, flo
     """How far the interval goes down and up; nothing where there is none."""
     ends = {"ap50": row.ap50_interval, "recall": row.recall_interval, "ap": None}[measure]
     return (0.0, 0.0) if ends is None else (max(value - ends[0], 0.0), max(ends[1] - value, 0.0))
-
-
-def _middle_m(row: DistanceRow) -> float:
-    """Middle of a bin in the logarithm; those without an end are drawn as wide as a quarter of their other one."""
-    low = row.low_m if row.low_m > 0 else (row.high_m or 1.0) / 1.6
-    high = row.high_m if row.high_m is not None else 1.25 * row.low_m
-    return float(np.sqrt(low * high))
 
 
 def _finish_share_axes(axes: Axes, title: str) -> None:

@@ -107,11 +107,11 @@ def write_detection_report(
     page = page_template("detection_report.html.j2").render(
         result=result,
         sentences=detection_sentences(result, best),
-        facts=_facts(result),
+        facts=detection_facts(result),
         summary=summary_table(result),
         tables=cell_tables(result),
         legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
-        distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],
+        distance_panels=[Markup(distance_panel(scored, measure)) for measure in MEASURES if _has_distances(result)],
         curve=Markup(curve_panel(matches)),
         speed=Markup(speed_panel(result)) if is_timed(result) else None,
         histograms=histograms,
@@ -145,12 +145,13 @@ def detection_sentences(result: DetectionResult, name: str) -> list[str]:
         "val": "which is the best one on split val",
         "scored images": "which is the best one on these same images",
     }
+    scenes = "1 scene" if row.scenes == 1 else f"{row.scenes} scenes"
     sentences = [
-        f"On {images}, with {data.boxes} drogues of {row.scenes} scenes to be found, {name} reaches an AP50 of "
-        f"{percent_text(row.ap50)} and an AP of {percent_text(row.ap)}.",
+        f"On {images}, with {data.boxes} drogues of {scenes} to be found, "
+        f"{name} reaches an AP50 of {percent_text(row.ap50)} and an AP of {percent_text(row.ap)}.",
         f"With a score of {plain_number(detector.operating_threshold)} or more, {chosen[detector.threshold_from]}, "
-        f"it finds {percent_text(row.recall)} of the drogues, and {percent_text(row.precision)} of its boxes "
-        "are right.",
+        f"it finds {percent_text(row.recall)} of the drogues, and "
+        + ("reports no box." if row.precision is None else f"{percent_text(row.precision)} of its boxes are right."),
     ]
     if alarms is not None:
         sentences.append(f"In {alarms.frames} pairs without a drogue it sees {alarms.boxes}.")
@@ -272,7 +273,8 @@ def _has_distances(result: DetectionResult) -> bool:
     return any(detector.distances for detector in result.detectors.values())
 
 
-def _facts(result: DetectionResult) -> list[tuple[str, str]]:
+def detection_facts(result: DetectionResult) -> list[tuple[str, str]]:
+    """Facts of the dataset and the thresholds, as pairs of a name and a value."""
     data = result.dataset
     thresholds = [
         f"{name} {plain_number(detector.operating_threshold)} ({detector.threshold_from})"
@@ -286,7 +288,9 @@ def _facts(result: DetectionResult) -> list[tuple[str, str]]:
         ("Drogues to be found", str(data.boxes)),
         (
             "Drogues that count neither way",
-            f"{data.ignored}, of which less than {percent_text(result.least_seen_fraction)} is seen",
+            f"{data.ignored}, as less than {percent_text(result.least_seen_fraction)} of each is seen"
+            if data.ignored
+            else "none",
         ),
         ("Pairs without a drogue", str(data.empty_frames)),
         ("Operating thresholds", "; ".join(thresholds)),

@@ -14,6 +14,7 @@ import pytest
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.detection.detection_figures import (
     MEASURES,
+    bin_distance_m,
     curve_panel,
     distance_panel,
     is_timed,
@@ -23,7 +24,9 @@ from droguekit.scoring.detection.detection_figures import (
     speed_panel,
 )
 from droguekit.scoring.detection.detection_report import (
+    detection_facts,
     detection_picture,
+    detection_sentences,
     worst_false_alarms,
     worst_misses,
     write_detection_report,
@@ -40,6 +43,7 @@ from droguekit.scoring.detection.detection_tables import (
 )
 from droguekit.scoring.detection.detection_truth import DetectionTruth, ImageTruth, read_detection_truth
 from droguekit.scoring.report.label_drawing import BOX_RGB, MARKER_RGB
+from droguekit.scoring.report.number_text import ABSENT
 from droguekit.scoring.results.detection_result import DetectedBox, DetectionResult, PairTimes
 from geometry.stereo import EYES
 from tests.support.parsed_page import ParsedPage
@@ -174,6 +178,27 @@ def test_json_comes_back_without_loss() -> None:
     assert DetectionResult.model_validate_json(result.to_json()) == result
 
 
+def test_bins_stand_at_the_mean_distance_of_their_images() -> None:
+    """The last bin has no end, and where its images are nobody can tell from its edges."""
+    truth = corpus(pairs=10)
+    far = [replace(image, distance_m=None if image.distance_m is None else 80.0) for image in truth.images]
+    scored = score_detections(DetectionTruth("far", "0" * 64, tuple(far)), {"mine": DetectorOutput([])}, "all")
+    (row,) = scored.result.detectors["mine"].distances
+    assert (row.low_m, row.high_m) == (40.0, None)
+    assert bin_distance_m(row, scored.images) == pytest.approx(80.0)
+    two = [replace(far[k], distance_m=distance_m) for k, distance_m in enumerate((41.0, 82.0))]
+    assert bin_distance_m(row, [*two, replace(far[2], distance_m=3.0)]) == pytest.approx((41.0 * 82.0) ** 0.5)
+
+
+def test_a_detector_without_boxes_and_a_single_scene_are_told_in_words() -> None:
+    truth = corpus(scenes=1, pairs=10)
+    result = score_detections(truth, {"mine": DetectorOutput([])}, "all").result
+    told = " ".join(detection_sentences(result, "mine"))
+    assert "drogues of 1 scene to be found" in told
+    assert "it finds 0.00 % of the drogues, and reports no box." in told and ABSENT not in told
+    assert ("Drogues that count neither way", "none") in detection_facts(result)
+
+
 def test_panels_are_wellformed_and_their_ids_differ() -> None:
     truth = corpus(pairs=10)
     scored = score_detections(
@@ -182,7 +207,7 @@ def test_panels_are_wellformed_and_their_ids_differ() -> None:
     matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
     assert not is_timed(scored.result)
     panels = [speed_panel(timed(scored).result)]
-    panels += [distance_panel(scored.result, measure) for measure in MEASURES]
+    panels += [distance_panel(scored, measure) for measure in MEASURES]
     panels += [
         curve_panel(matches),
         score_panel("a<b $x", 0, matches["a<b $x"], 0.5),
