@@ -38,7 +38,7 @@ EXAMPLES = {
 }
 
 
-_COLUMNS, _TILE_WIDTH_PX = 4, 400
+_TILE_WIDTH_PX = 400
 
 
 def preview(
@@ -50,7 +50,10 @@ def preview(
             "--count", help="How many pairs, spread evenly; 20, or 150 of an animation or overlay.", show_default=False
         ),
     ] = None,
-    columns: Annotated[int, typer.Option("--columns", help="Tiles in a row, or families side by side.")] = _COLUMNS,
+    columns: Annotated[
+        int | None,
+        typer.Option("--columns", help="Tiles in a row, 4; or families side by side, 1.", show_default=False),
+    ] = None,
     tile_width: Annotated[int, typer.Option("--tile-width", metavar="PX", help="Width of a tile.")] = _TILE_WIDTH_PX,
     by_family: Annotated[
         bool, typer.Option("--by-family", help="A row for each family of conditions, without labels.")
@@ -79,7 +82,7 @@ def preview(
     """
     if sum(file is not None for file in (out, animate, overlay)) != 1:
         raise ValueError("--out, --animate, --overlay: give one of them, a file for a sheet or for a video")
-    if out is None and (by_family or columns != _COLUMNS or tile_width != _TILE_WIDTH_PX):
+    if out is None and (by_family or columns is not None or tile_width != _TILE_WIDTH_PX):
         raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of a video")
     if sequence is not None and out is not None:
         raise ValueError("--sequence: goes with --animate or --overlay; leave it out for a sheet")
@@ -90,6 +93,8 @@ def preview(
     if out is not None:
         from droguekit.visualization.contact_sheet import write_contact_sheet
 
+        if columns is None:
+            columns = 1 if by_family else 4
         shown, pairs = write_contact_sheet(dataset, out, 20 if count is None else count, columns, tile_width, by_family)
         typer.echo(f"wrote {out}: {shown} of {pairs} pairs")
         return
@@ -99,13 +104,15 @@ def preview(
     if animate is not None:
         from droguekit.visualization.side_view import write_animation
 
-        shown, length_s = write_animation(source, animate, most, sequence)
-    elif overlay is not None:
+        written = write_animation(source, animate, most, sequence)
+    else:
         from droguekit.visualization.overlay_video import read_estimates_of_method, write_overlay_video
 
         chosen = ("", {}) if estimates is None else read_estimates_of_method(estimates, source, method)
-        shown, length_s = write_overlay_video(source, overlay, most, sequence, chosen)
-    typer.echo(f"wrote {animate or overlay}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
+        assert overlay is not None
+        written = write_overlay_video(source, overlay, most, sequence, chosen)
+    of = f"{written.pairs} of {len(source.frame_indices)} pairs, {written.length_s:.1f} s{written.pace_text}"
+    typer.echo(f"wrote {animate or overlay}: {of}")
 
 
 def browse(

@@ -17,6 +17,7 @@ from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
+from droguekit.visualization.video_file import evenly
 
 _HUB_RGB = (255, 120, 220)
 _TEXT_RGB = (255, 255, 255)
@@ -83,8 +84,7 @@ def _draw_sheet(
     if by_family and isinstance(source, Dataset):
         sheet, shown = _family_sheet(source, out, count, columns, tile_width)
         return sheet, shown, pairs
-    places = np.linspace(0, pairs - 1, min(count, pairs)).round()
-    frames = [source.frame_indices[int(place)] for place in places]
+    frames = evenly(source.frame_indices, count)
     tiles = (
         _draw_blind_tile(source.pair(index), tile_width)
         if isinstance(source, BlindDataset)
@@ -141,7 +141,7 @@ def _family_sheet(dataset: Dataset, out: Path, count: int, columns: int, tile_wi
     Args:
         dataset: of the pairs.
         out: file of the sheet.
-        count: tiles at most; every family gets the same number, as long as it has pairs.
+        count: tiles at most; every family gets the same number, as long as it has pairs, spread evenly over them.
         columns: families side by side.
         tile_width_px: width of a tile; its height follows the images.
 
@@ -157,7 +157,7 @@ def _family_sheet(dataset: Dataset, out: Path, count: int, columns: int, tile_wi
     if count < len(families):
         raise ValueError(f"--count: must be at least {len(families)}, a pair for each family, got {count}")
     length = min(count // len(families), max(map(len, families.values())))
-    shown = {name: indices[:length] for name, indices in families.items()}
+    shown = {name: evenly(indices, length) for name, indices in families.items()}
     rows = math.ceil(len(shown) / min(columns, len(shown)))
     blocks = (_family_row(dataset, name, indices, length, tile_width_px) for name, indices in shown.items())
     sheet = _grid(blocks, (rows, math.ceil(len(shown) / rows)), out, down=True)

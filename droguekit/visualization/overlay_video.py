@@ -23,8 +23,9 @@ from droguekit.scoring.report.label_drawing import (
     draw_crosses,
     resized,
 )
+from droguekit.scoring.report.number_text import millimetres, three_digits
 from droguekit.visualization.drogue_outlines import drogue_rings, ring_images
-from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
+from droguekit.visualization.video_file import WrittenVideo, check_video, evenly, write_pairs
 from geometry.se3 import Array, RigidTransform
 
 TRUE_RGB: Rgb = (80, 255, 100)
@@ -34,6 +35,8 @@ _TEXT_RGB: Rgb = (235, 238, 242)
 _SOFT_RGB: Rgb = (150, 158, 168)
 _PAPER = 24
 _WHOLE_WIDTH_PX, _BAR_PX = 800, 64
+# Characters of a method's name that leave room for its numbers.
+_MOST_NAME = 32
 # Side of the close-up over that of the drogue's box.
 _MARGIN = 1.35
 _SMALLEST_PX = 32.0
@@ -65,7 +68,7 @@ def read_estimates_of_method(path: Path, dataset: Dataset, method: str | None) -
 
 def write_overlay_video(
     dataset: Dataset, path: Path, count: int, sequence_id: int | None, estimates: tuple[str, Mapping[int, Estimate]]
-) -> tuple[int, float]:
+) -> WrittenVideo:
     """Draw pairs of a dataset, spread evenly, and write them in the order of time.
 
     Args:
@@ -74,9 +77,6 @@ def write_overlay_video(
         count: pairs at most.
         sequence_id: only pairs of this sequence, or None for all.
         estimates: a method's name and its estimates by frame; an empty name shows the truth alone.
-
-    Returns:
-        Number of pairs, and length of the video [s].
 
     Raises:
         ValueError: no such pairs, or one that cannot be read.
@@ -99,9 +99,7 @@ def write_overlay_video(
         index = record.frame_index
         return draw_overlay(record, dataset.images(index), drogue, method, of_method.get(index))
 
-    length_s = period_s(records)
-    write_video(path, map(draw, records), length_s)
-    return len(records), len(records) * length_s
+    return write_pairs(path, map(draw, records), records)
 
 
 class _Overlay(NamedTuple):
@@ -205,7 +203,8 @@ def _caption_bar(record: PairRecord, method: str, estimate: Estimate | None, wid
     _write(bar, f"frame {record.frame_index}{when}: {where}", (14, 26), _TEXT_RGB)
     _write(bar, "true", (14, 52), TRUE_RGB)
     if method:
-        _write(bar, f"{method}: {_error_text(record, estimate)}", (72, 52), ESTIMATE_RGB)
+        shown = method if len(method) <= _MOST_NAME else f"{method[: _MOST_NAME - 3]}..."
+        _write(bar, f"{shown}: {_error_text(record, estimate)}", (72, 52), ESTIMATE_RGB)
         _write(bar, "+ measured centres, left eye", (width - 290, 26), _SOFT_RGB)
     return bar
 
@@ -218,12 +217,15 @@ def _error_text(record: PairRecord, estimate: Estimate | None) -> str:
     if record.left_from_drogue is None:
         return "a fix, but there is no drogue"
     error = pose_error(estimate.left_from_drogue, record.left_from_drogue)
-    x_mm, y_mm, z_mm = 1e3 * error.components[:3]
-    pitch_deg, yaw_deg = error.components[3:]
-    return (
-        f"{1e3 * error.position_m:.2f} mm off (x {x_mm:+.2f}, y {y_mm:+.2f}, z {z_mm:+.2f}), "
-        f"pitch {pitch_deg:+.2f} deg, yaw {yaw_deg:+.2f} deg"
-    )
+    x_mm, y_mm, z_mm = map(_signed, 1e3 * error.components[:3])
+    pitch_deg, yaw_deg = map(_signed, error.components[3:])
+    size = f"{millimetres(error.position_m)} mm off (x {x_mm}, y {y_mm}, z {z_mm})"
+    return f"{size}, pitch {pitch_deg} deg, yaw {yaw_deg} deg"
+
+
+def _signed(value: float) -> str:
+    """Three significant digits behind a sign that OpenCV's fonts have."""
+    return ("-" if value < 0 else "+") + three_digits(abs(value))
 
 
 def _write(bar: Picture, text: str, place: tuple[int, int], color: Rgb) -> None:

@@ -20,7 +20,7 @@ from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
 from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
-from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
+from droguekit.visualization.video_file import WrittenVideo, check_video, evenly, write_pairs
 from geometry.se3 import Array, RigidTransform
 from render.surfaces import frame_tanker_surfaces
 
@@ -34,7 +34,7 @@ _BODY_RADIUS_M, _BODY_LENGTH_M, _NOSE_LENGTH_M, _BELOW_EYE_M = 0.5, 7.0, 1.6, 0.
 _RING = 32
 
 
-def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int | None) -> tuple[int, float]:
+def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int | None) -> WrittenVideo:
     """Draw pairs of a dataset, spread evenly, and write them in the order of time.
 
     Args:
@@ -43,19 +43,16 @@ def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int |
         count: pairs at most.
         sequence_id: only pairs of this sequence, or None for all.
 
-    Returns:
-        Number of pairs, and length of the video [s].
-
     Raises:
         ValueError: no such pairs, or one that cannot be read.
         OSError: it cannot be written.
     """
     check_video("--animate", path, count)
     records = [dataset.record(index) for index in _chosen(dataset, count, sequence_id)]
-    length_s = period_s(records)
     side_view = SideView(records)
-    write_video(path, (side_view.draw(record, dataset.images(record.frame_index)) for record in records), length_s)
-    return len(records), len(records) * length_s
+    return write_pairs(
+        path, (side_view.draw(record, dataset.images(record.frame_index)) for record in records), records
+    )
 
 
 def _chosen(dataset: Dataset, count: int, sequence_id: int | None) -> list[int]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -66,11 +68,45 @@ def evenly(indices: Sequence[int], count: int) -> list[int]:
     return [indices[int(place)] for place in places]
 
 
-def period_s(records: Sequence[PairRecord]) -> float:
-    """Time that each picture is shown: the time between pairs of a sequence. [s]"""
-    if records[0].sequence_id is None or len(records) < 2:
-        return _SLIDE_S
-    return float(np.clip(np.median(np.diff([record.time_s for record in records])), _FASTEST_S, _SLOWEST_S))
+class WrittenVideo(NamedTuple):
+    """What a video shows.
+
+    Attributes:
+        pairs: number of its pictures.
+        length_s: its length. [s]
+        pace: how many times as fast as it flew a sequence goes by; 1 where pairs do not follow each other.
+    """
+
+    pairs: int
+    length_s: float
+    pace: float
+
+    @property
+    def pace_text(self) -> str:
+        """The pace in words; empty where it is that of the flight."""
+        return "" if self.pace == 1 else f", {self.pace:.2g} times as fast as it flew"
+
+
+def write_pairs(path: Path, pictures: Iterable[Picture], records: Sequence[PairRecord]) -> WrittenVideo:
+    """Write a picture of each pair, in the time of their sequences as far as a viewer can follow it; see `write_video`.
+
+    Args:
+        path: ends in .gif or .mp4.
+        pictures: (H, W, 3) each.
+        records: of the same pairs.
+    """
+    own = [
+        b.time_s - a.time_s
+        for a, b in pairwise(records)
+        if a.sequence_id is not None and a.sequence_id == b.sequence_id
+    ]
+    picture_s, pace = _SLIDE_S, 1.0
+    if own:
+        own_s = float(np.median(own))
+        picture_s = float(np.clip(own_s, _FASTEST_S, _SLOWEST_S))
+        pace = own_s / picture_s
+    write_video(path, pictures, picture_s)
+    return WrittenVideo(len(records), len(records) * picture_s, pace)
 
 
 def _write_gif(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:

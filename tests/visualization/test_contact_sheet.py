@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import PairRecord
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.visualization import contact_sheet
 from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
@@ -48,7 +51,9 @@ def preview(dataset: Path, out: Path, *options: str) -> int:
     ("options", "shown", "rows", "columns", "length"),
     [
         # Rows are as long as the longest family, and no column is empty.
-        (["--count", "400"], 9, 1, 3, 4),
+        (["--count", "400", "--columns", "4"], 9, 1, 3, 4),
+        # A row for each family unless columns are asked for.
+        (["--count", "6"], 5, 3, 1, 2),
         (["--count", "6", "--columns", "2"], 5, 2, 2, 2),
         (["--count", "3", "--columns", "1"], 3, 3, 1, 1),
     ],
@@ -71,6 +76,23 @@ def test_rows_of_families_are_full(
         rows * (CAPTION_PX + HEIGHT_PX + GAP_PX) + GAP_PX,
         columns * (width_px + GAP_PX) + GAP_PX,
     )
+
+
+def test_tiles_of_a_family_are_spread_over_its_pairs(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: dict[str, list[int]] = {}
+
+    def draw_plain(images: StereoImages, record: PairRecord, width_px: int) -> np.ndarray:
+        drawn.setdefault(record.conditions.family, []).append(record.frame_index)
+        return np.zeros((HEIGHT_PX, width_px, 3), np.uint8)
+
+    monkeypatch.setattr(contact_sheet, "_plain_tile", draw_plain)
+    assert preview(dataset, tmp_path / "sheet.png", "--by-family", "--count", "6") == DONE
+    source = Dataset(dataset)
+    for family, shown in drawn.items():
+        own = [index for index in source.frame_indices if source.record(index).conditions.family == family]
+        assert shown == [own[0], own[-1]][: len(own)]
 
 
 def test_fewer_pairs_than_families_are_refused(

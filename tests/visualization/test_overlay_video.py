@@ -14,6 +14,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.scoring.report.label_drawing import Rgb
+from droguekit.visualization import overlay_video
 from droguekit.visualization.overlay_video import ESTIMATE_RGB, TRUE_RGB, draw_overlay, write_overlay_video
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
@@ -107,6 +108,38 @@ def test_outlines_lie_where_the_poses_project(flight: Path, estimates: Path) -> 
             assert np.mean(np.array(around) < 60) > 0.9
             compared += inside.sum()
     assert compared > 100
+
+
+def test_a_long_name_leaves_room_for_the_numbers(flight: Path) -> None:
+    dataset = Dataset(flight)
+    index = next(entry.frame_index for entry in dataset.manifest.frames if not entry.empty)
+    record, images = dataset.record(index), dataset.images(index)
+    pose = record.left_from_drogue
+    assert pose is not None
+
+    def bar(name: str, off_m: float) -> np.ndarray:
+        moved = RigidTransform(pose.rotation, pose.translation_m + np.array([0.0, 0.0, off_m]))
+        fix = PoseEstimate(frame_index=index, method=name, left_from_drogue=moved)
+        return draw_overlay(record, images, record.frame.drogue, name, fix)[:BAR_PX]
+
+    long = "w" * 80
+    # The last number of the line tells two errors apart, and the line ends before the picture does.
+    assert (bar(long, 1e-3) != bar(long, 1.5)).any()
+    nothing = draw_overlay(record, images, record.frame.drogue, "", None)[:BAR_PX]
+    assert (bar(long, -1.5)[36:, -20:] == nothing[36:, -20:]).all()
+
+
+def test_errors_have_three_digits(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset, told = Dataset(flight), list[str]()
+    index = next(entry.frame_index for entry in dataset.manifest.frames if not entry.empty)
+    record = dataset.record(index)
+    pose = record.left_from_drogue
+    assert pose is not None
+    monkeypatch.setattr(overlay_video.cv2, "putText", lambda bar, text, *rest: told.append(text))
+    moved = RigidTransform(pose.rotation, pose.translation_m + np.array([0.0, 0.0, -1.234e-6]))
+    fix = PoseEstimate(frame_index=index, method="own", left_from_drogue=moved)
+    draw_overlay(record, dataset.images(index), record.frame.drogue, "own", fix)
+    assert any("own: 0.00123 mm off (x +0.00, y +0.00, z -0.00123)" in text for text in told)
 
 
 def test_truth_alone_needs_no_estimates(flight: Path, tmp_path: Path) -> None:

@@ -254,11 +254,16 @@ def _describe_estimate(estimate: Estimate, truth: RigidTransform | None) -> dict
         "pose": _pose(pose),
         "reason": None if isinstance(estimate, PoseEstimate) else estimate.reason,
         # Position [mm], pitch and yaw [deg].
-        "error": error and [round(1e3 * error.position_m, 3), *(round(float(e), 4) for e in error.components[3:])],
+        "error": error and [_significant(1e3 * error.position_m), *map(_significant, error.components[3:])],
         "centroids": [
             [f.eye, str(f.index), *(round(c, _PX_DIGITS) for c in f.center_px), f.used] for f in estimate.features
         ],
     }
+
+
+def _significant(value: float) -> float:
+    """Five significant digits: an error may be of micrometres, and the page shows three."""
+    return float(f"{value:.5g}")
 
 
 def _pose(pose: RigidTransform | None) -> list[float] | None:

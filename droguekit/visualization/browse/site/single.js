@@ -64,6 +64,13 @@
     byId(id).hidden = rows.length === 0;
   }
 
+  /** Three significant digits and never an exponent, as the reports write numbers. */
+  function threeDigits(value) {
+    const rounded = value.toExponential(2);
+    const decimals = Math.max(0, 2 - Number(rounded.split("e")[1]));
+    return Number(rounded).toFixed(Math.min(decimals, 100)).replace("-", "\u2212");
+  }
+
   function estimateCells(estimate) {
     const name = cell("th", estimate.method);
     if (!estimate.pose) return [name, cell("td", `no fix: ${estimate.reason}`, 3)];
@@ -72,7 +79,7 @@
       return [name, cell("td", `${what} at ${estimate.pose[11].toFixed(2)}\u00a0m`, 3)];
     }
     const [position, pitch, yaw] = estimate.error;
-    const degrees = (value) => `${value.toFixed(3).replace("-", "\u2212")}°`;
+    const degrees = (value) => `${threeDigits(value)}°`;
     return [name, cell("td", droguekit.millimetres(position)), cell("td", degrees(pitch)), cell("td", degrees(yaw))];
   }
 
@@ -131,7 +138,7 @@
   };
 
   droguekit.millimetres = function (error_mm) {
-    return `${error_mm.toFixed(error_mm < 100 ? 2 : 0)}\u00a0mm`;
+    return `${threeDigits(error_mm)}\u00a0mm`;
   };
 
   droguekit.toggleZoom = function () {
