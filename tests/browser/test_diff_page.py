@@ -12,7 +12,7 @@ import pytest
 from droguekit.assurance.dataset_diff import DatasetDiff
 from droguekit.assurance.law_comparison import compare_numbers, compare_words
 from droguekit.visualization.diff_page import write_diff_page
-from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, recipe_text
+from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
 from tests.support.small_datasets import rendered
 
 OpenPage = Callable[..., Any]
