@@ -17,6 +17,7 @@ from droguekit.assurance.design_domain import Crossing, DesignDomain, Placed
 from droguekit.assurance.solved_cases import SolvedCases, solved_cases
 from droguekit.batch.progress import ProgressReport
 from droguekit.scoring.confidence_intervals import Interval, fraction_interval
+from droguekit.scoring.report.number_text import percent
 
 _MOST_LINES = 20
 
@@ -32,6 +33,12 @@ class Share(FrozenModel):
     hits: int
     count: int
     interval: Interval
+
+    @property
+    def interval_text(self) -> str:
+        """Both ends in percent."""
+        low, high = map(percent, self.interval)
+        return f"{low.removesuffix(' %')} to {high}"
 
 
 class DomainCell(FrozenModel):
@@ -201,13 +208,15 @@ def coverage_lines(coverage: Coverage) -> Iterator[str]:
             yield f"  and {len(lacking) - _MOST_LINES} more"
         for name in coverage.scored:
             worst = worst_cell(crossing, name)
-            if worst is not None:
-                share = worst.scores[name]
-                low, high = share.interval
-                yield (
-                    f"  {name} is worst at {cell_name(crossing, worst)}: {share.hits} of {share.count} solved, "
-                    f"{100 * low:.0f} to {100 * high:.0f} %"
-                )
+            if worst is None:
+                continue
+            share = worst.scores[name]
+            yield (
+                f"  {name} solved every case"
+                if share.hits == share.count
+                else f"  {name} is worst at {cell_name(crossing, worst)}: {share.hits} of {share.count} solved, "
+                f"{share.interval_text}"
+            )
 
 
 def _counted(count: int, noun: str) -> str:

@@ -10,6 +10,7 @@ from datasets_manifest.atomic import write_text_atomic
 from droguekit.assurance.coverage import Coverage, CrossingCoverage, DomainCell, Share
 from droguekit.assurance.design_domain import DesignDomain
 from droguekit.scoring.report.html_page import page_template
+from droguekit.scoring.report.number_text import percent
 
 
 class _ShownCell(NamedTuple):
@@ -93,5 +94,4 @@ def _cell(cell: DomainCell, crossing: CrossingCoverage) -> _ShownCell:
 
 
 def _share_text(share: Share) -> str:
-    low, high = (round(100 * end) for end in share.interval)
-    return f"{100 * share.hits / share.count:.0f} % ({low} to {high})"
+    return f"{percent(share.hits / share.count)} ({share.interval_text})"

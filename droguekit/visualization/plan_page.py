@@ -22,8 +22,9 @@ from droguekit.batch.recipe_plan import RecipePlan, check_places, check_sizes, d
 from droguekit.scoring.report.html_page import page_template
 from geometry.se3 import Array
 
-_PANEL_IN = (6.2, 4.4)
-_DPI = 130
+# A phone shows a picture 330 px wide, and its letters are to have 9 px there.
+PANEL_IN = (5.0, 3.8)
+DPI = 160
 _BAR, _LAW = "#7aa9d8", "#b03a2e"
 _BINS = 24
 _CELL_PX = 40
@@ -35,7 +36,7 @@ _LABELS = (
     (np.inf, (1.0,)),
 )
 _SHORT_RANGE = 3.0
-_MOST_STATION_LABELS = 12
+_MOST_STATION_LABELS = 8
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ def _families(axes: Axes, planned: RecipePlan) -> None:
     axes.invert_yaxis()
     axes.set_xlim(0, max(pairs) * 1.4)
     axes.set_xlabel("Stereo pairs")
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def _distances(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
@@ -133,7 +135,7 @@ def _distances(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
         axes.bar(places, counts, color=_BAR)
         labelled = places[:: -(-len(stations) // _MOST_STATION_LABELS)]
         axes.set_xticks(labelled, [f"{stations[place]:g}" for place in labelled])
-        axes.set_ylabel("Stereo pairs at each station")
+        _count_pairs(axes, "Stereo pairs at each station")
         return
     edges = _log_edges(distances)
     axes.stairs(np.histogram(distances, edges)[0], edges, color=_BAR, fill=True)
@@ -162,7 +164,8 @@ def _places(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
     edges = [np.linspace(-0.5, n - 0.5, max(4, n // _CELL_PX) + 1) for n in (camera.width_px, camera.height_px)]
     counts = np.histogramdd(centers, edges)[0].T
     image = axes.pcolormesh(edges[0], edges[1], np.where(counts > 0, counts, np.nan), cmap="viridis", vmin=0)
-    axes.figure.colorbar(image, ax=axes, label="Stereo pairs in a cell", shrink=0.8)
+    whole = MaxNLocator(5, integer=True)
+    axes.figure.colorbar(image, ax=axes, label="Stereo pairs in a cell", shrink=0.8, ticks=whole)
     axes.set(aspect="equal", xlim=(-0.5, camera.width_px - 0.5), ylim=(camera.height_px - 0.5, -0.5))
     axes.set_xlabel("u, to the right [px]")
     axes.set_ylabel("v, down [px]")
@@ -173,9 +176,14 @@ def _log_edges(values: Array) -> Array:
     return np.geomspace(low * (1 - 1e-9), max(high, low * 1.01) * (1 + 1e-9), _BINS + 1)
 
 
+def _count_pairs(axes: Axes, label: str) -> None:
+    axes.set_ylabel(label)
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
 def _logarithmic(axes: Axes) -> None:
     axes.set_xscale("log")
-    axes.set_ylabel("Stereo pairs in a bin")
+    _count_pairs(axes, "Stereo pairs in a bin")
     label_logarithmic(axes.xaxis, *axes.get_xlim())
 
 
@@ -198,7 +206,7 @@ def label_logarithmic(axis: Axis, low: float, high: float) -> None:
 def draw_figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:
     """A plot in a page's style, drawn without pyplot and with matplotlib's settings left as they were."""
     with matplotlib.rc_context({"font.family": "sans-serif", "font.size": 10.0}):
-        figure = Figure(figsize=_PANEL_IN, dpi=_DPI, layout="constrained")
+        figure = Figure(figsize=PANEL_IN, dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         axes.set_title(title, loc="left", fontsize=11.5)

@@ -391,7 +391,7 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     if clipped:
         yield (
             f"{name} are brighter than the sensor's range {when} up to {clipped[-1].distance_m:.3g} m: shorten "
-            "exposure.auto_time_s, or meter the plate (exposure.auto_meter)"
+            "exposure.auto_time_s"
         )
 
 

@@ -11,9 +11,18 @@ import pytest
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
-from droguekit.assurance.coverage import Coverage, CrossingCoverage, measure_coverage, worst_cell
+from droguekit.assurance.coverage import (
+    Coverage,
+    CrossingCoverage,
+    DomainCell,
+    Share,
+    coverage_lines,
+    measure_coverage,
+    worst_cell,
+)
 from droguekit.assurance.design_domain import CLOSED_WORDS, SHIPPED, WORDS, DesignDomain, load_domain
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
+from droguekit.scoring.confidence_intervals import fraction_interval
 from geometry.se3 import Array, RigidTransform
 from tests.support.recipe_builder import RIG_160_PX, between, recipe_text
 from tests.support.small_datasets import rendered
@@ -135,6 +144,26 @@ def test_poses_are_scored_cell_by_cell(dataset: Path, domain: Path, tmp_path: Pa
     assert [share.count for share in shares] == [cell.pairs for cell in crossing.cells]
     worst = worst_cell(crossing, "far")
     assert worst is not None and worst.bins == ("8 to 10",)
+
+
+def test_shares_are_never_rounded_to_all_or_none() -> None:
+    def lines(*hits: int) -> list[str]:
+        cells = tuple(
+            DomainCell(
+                bins=(str(place),),
+                pairs=300,
+                scores={"own": Share(hits=count, count=300, interval=fraction_interval(count, 300))},
+            )
+            for place, count in enumerate(hits)
+        )
+        crossing = CrossingCoverage(of=("x",), fewest_pairs=0, outside=0, cells=cells)
+        coverage = Coverage(
+            dataset="d", dataset_sha256="0", domain="o", pairs=600, outside={}, scored=("own",), crossings=(crossing,)
+        )
+        return list(coverage_lines(coverage))
+
+    assert lines(300, 299)[-1] == "  own is worst at x 1: 299 of 300 solved, 98.1 to 99.9 %"
+    assert lines(300, 300)[-1] == "  own solved every case"
 
 
 def test_boxes_are_scored_cell_by_cell(dataset: Path, domain: Path, tmp_path: Path) -> None:

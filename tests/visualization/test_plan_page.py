@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from droguekit.batch.recipe_plan import plan_recipe
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from droguekit.visualization.plan_page import _distances, label_logarithmic
+from droguekit.visualization.plan_page import DPI, PANEL_IN, _distances, _families, _sizes, label_logarithmic
 from tests.support.recipe_builder import RecipeTable, between, build_recipe, recipe_text, stations
 from tests.support.small_datasets import SWINGING
 
@@ -67,7 +67,7 @@ def test_stations_have_bars_and_no_law_of_sizes(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize("count", [1, 12, 13, 40])
 def test_labels_of_many_stations_stay_apart(count: int) -> None:
     recipe = build_recipe(BASE, distance=stations(*np.linspace(2.25, 120.5, count).round(2)), frames={"count": count})
-    figure = Figure(figsize=(6.2, 4.4), dpi=130, layout="constrained")
+    figure = Figure(figsize=PANEL_IN, dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
     _distances(axes, recipe, plan_recipe(recipe))
     figure.draw_without_rendering()
@@ -75,6 +75,30 @@ def test_labels_of_many_stations_stay_apart(count: int) -> None:
     boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
     assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
     assert axes.get_xticklabels()[0].get_text() == "2.25"
+
+
+FAMILIES: list[dict[str, object]] = [{"name": "clear"}, {"name": "hazy"}]
+
+
+def test_pairs_are_counted_in_whole_numbers() -> None:
+    recipe = build_recipe(BASE, distance=stations(2.0, 5.0), frames={"count": 2, "scenes": 2}, families=FAMILIES)
+    planned = plan_recipe(recipe)
+    for draw, axis in (
+        (lambda axes: _distances(axes, recipe, planned), "yaxis"),
+        (lambda axes: _sizes(axes, recipe, planned), "yaxis"),
+        (lambda axes: _families(axes, planned), "xaxis"),
+    ):
+        axes = Figure(figsize=PANEL_IN, dpi=DPI).add_subplot()
+        draw(axes)
+        places = getattr(axes, axis).get_majorticklocs()
+        assert len(places) >= 2 and np.array_equal(places, np.round(places))
+
+
+def test_letters_can_be_read_on_a_phone(tmp_path: Path) -> None:
+    (height_px, width_px) = pictures(page_of(tmp_path))[0].shape[:2]
+    assert height_px < width_px
+    # 10 pt as drawn; a page 360 px wide leaves a picture some 330.
+    assert 10 / 72 * DPI * 330 / width_px >= 9
 
 
 def test_the_law_is_printed_with_its_chi_square(capsys: pytest.CaptureFixture[str]) -> None:

@@ -131,6 +131,8 @@ def _draw_errors(axes: Axes, result: BenchmarkResult, quantity: Quantity) -> Non
         shift = step ** (k - (len(names) - 1) / 2)
         _draw_method(axes, name, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
     _draw_bound(axes, result.reference, quantity)
+    if not axes.has_data():
+        axes.text(0.5, 0.5, "every error is 0", transform=axes.transAxes, ha="center", va="center")
     finish_distance_axes(axes, quantity.title)
 
 

@@ -339,15 +339,18 @@ def write_report(
         )
     styles = method_styles(list(result.methods))
     times = stage_times_table(estimates)
+    found = [row for method in result.methods.values() for row in method.bins if row.fixes]
+    has_bound = any(place.bound is not None for place in result.reference)
+    bound = [("Cramér–Rao bound", Markup(legend_key(None)))] if has_bound else []
     page = page_template("pose_report.html.j2").render(
         result=result,
         sentences=result_sentences(result),
         facts=dataset_facts(data.manifest, estimates.name),
         tiles=[(tile, plain_number(tile.distance_m)) for tile in contact_tiles(data, faults=faults)],
-        panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES],
-        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
+        panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES] if found else [],
+        has_zeros=any(row.value(quantity.key) == 0 for row in found for quantity in QUANTITIES),
+        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()] + bound,
         many_methods=len(styles) > FEW_METHODS,
-        bound_key=Markup(legend_key(None)),
         tables=[
             overall_table(result),
             position_table(result),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.types.estimates import NoFix, write_estimates
+from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.pose_benchmark import run_benchmark
 from droguekit.scoring.poses.method_scores import best_method
@@ -195,6 +196,41 @@ def test_the_box_stands_where_the_record_has_it(build: SimpleNamespace) -> None:
         edge = tile[:, round((box[0] + 0.5) * scale - 0.5)]
         # The yellow left edge of the box runs down this column, blurred over two by smoothing.
         assert edge[:, 0].max() > 60
+
+
+def page_with(folder: Path, estimates: Sequence[Estimate], out: Path) -> str:
+    """The page of a file of estimates in the folder of `out`."""
+    write_estimates(out / "estimates.jsonl", estimates)
+    write_report(folder, out / "estimates.jsonl", run_benchmark(folder, out / "estimates.jsonl"), out / "page.html")
+    return (out / "page.html").read_text(encoding="utf-8")
+
+
+def test_without_a_pose_there_are_words_instead_of_empty_axes(dataset: DatasetFixture, tmp_path: Path) -> None:
+    folder, records = dataset
+    text = page_with(folder, [NoFix(frame_index=r.frame_index, method="n", reason="dark") for r in records], tmp_path)
+    assert "No method found a pose, so there is no error to draw." in text
+    assert "<svg" not in text and "Cramér–Rao bound</span>" not in text
+
+
+def test_an_error_of_zero_is_told_where_an_axis_cannot_show_it(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path
+) -> None:
+    folder, records = dataset
+    exact = [
+        PoseEstimate(frame_index=r.frame_index, method="exact", left_from_drogue=r.left_from_drogue)
+        for r in records
+        if r.left_from_drogue is not None
+    ]
+    text = page_with(folder, exact, tmp_path)
+    assert text.count("every error is 0") == len(QUANTITIES)
+    assert "An error of exactly 0 has no place on a logarithmic axis" in text
+    # Without centroids no bound is known.
+    assert "Cramér–Rao bound</span>" not in text
+
+
+def test_the_legend_names_the_bound_that_is_drawn(page_text: str) -> None:
+    assert "Cramér–Rao bound</span>" in page_text
+    assert "An error of exactly 0" not in page_text
 
 
 def test_tiles_span_the_distances(dataset: DatasetFixture) -> None:
