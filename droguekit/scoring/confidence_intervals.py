@@ -145,7 +145,8 @@ def percentile_intervals(
         of_row = drawn + count * np.arange(len(drawn))[:, None]
         times = np.bincount(of_row.ravel(), minlength=drawn.size).reshape(drawn.shape)
         found.append([_weighted_percentiles(column, times[:, place], percentiles) for column in sizes.T])
-    return np.percentile(np.concatenate(found, axis=2), _ENDS, axis=2).transpose(1, 2, 0)
+    ends: Array = np.percentile(np.concatenate(found, axis=2), _ENDS, axis=2).transpose(1, 2, 0)
+    return ends
 
 
 def _weighted_percentiles(values: Array, times: NDArray[np.int64], percentiles: tuple[float, ...]) -> Array:

@@ -180,3 +180,9 @@ def test_pairs_without_truth_show_estimates_alone(browsed: BrowsedDataset, open_
     rim = corners(page, "#left .estimate polygon.rim")[0]
     assert x < rim[:, 0].min() and rim[:, 0].max() < x + width < rim[:, 0].min() + 2.5 * np.ptp(rim, axis=0).max()
     assert opened.faults == []
+
+
+def test_errors_have_three_digits_as_in_reports(browsed: BrowsedDataset, open_page: OpenPage) -> None:
+    page = open_page(browsed.page).page
+    texts = page.evaluate("[0.000123456, 0.0, 0.99999, 12.345, 1234.5].map((x) => droguekit.millimetres(x))")
+    assert texts == [f"{text}\u00a0mm" for text in ("0.000123", "0.00", "1.00", "12.3", "1230")]
