@@ -39,7 +39,7 @@ from droguekit.scoring.sequences.sequence_truth import (
     true_sequences,
     true_state,
 )
-from droguekit.scoring.sequences.tracking_scores import reacquisition, score_regions
+from droguekit.scoring.sequences.tracking_scores import has_found, reacquisition, score_regions
 
 Methods = Mapping[str, Mapping[int, Estimate]]
 Truths = Mapping[int, DrogueTruth | None]
@@ -261,9 +261,7 @@ def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Est
 
 
 def _has_found(state: TrueState, estimate: Estimate | None) -> bool:
-    """Whether an estimate is a pose whose position errs by no more than the radius of the rim."""
     pose, drogue = state.left_from_drogue, state.drogue
     if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
         return False
-    error_m = estimate.left_from_drogue.translation_m - pose.translation_m
-    return float(np.linalg.norm(error_m)) <= drogue.rim_radius_m
+    return has_found(estimate.left_from_drogue.translation_m - pose.translation_m, drogue.rim_radius_m)

@@ -1,5 +1,7 @@
 """Criteria and measured values with one-sided 95 % limits, for people (bars.md, terminal) and programs (bars.json).
 
+Too few values have an infinite limit: nothing that they show excludes a larger true value with 95 %.
+
 Pairs of a sequence are not independent of their neighbours; sequences are independent of each other. The `block` limits
 are those of the sequences' own means, by Student's law, or of resampled sequences. They are never less than those of
 independent pairs: a few sequences that happen to agree would promise too much. Pairs of a single sequence count as
@@ -32,11 +34,11 @@ def rms_limit(values: ArrayLike) -> ValueWithLimit:
 
 
 def mean_limit(values: ArrayLike) -> ValueWithLimit:
-    """Mean, by Student's law; with a single number the limit is the value itself."""
+    """Mean, by Student's law; a single number has no scatter, and so an infinite limit."""
     numbers = np.asarray(values, dtype=np.float64)
     mean, count = float(numbers.mean()), numbers.size
     if count < 2:
-        return mean, mean
+        return mean, float("inf")
     return mean, mean + float(t.ppf(CONFIDENCE, count - 1) * numbers.std(ddof=1) / np.sqrt(count))
 
 
@@ -52,14 +54,29 @@ def share_limit(hits: int, count: int) -> ValueWithLimit:
     return hits / count, 1.0 if hits == count else float(beta.ppf(CONFIDENCE, hits + 1, count - hits))
 
 
+def partial_share_limit(parts: ArrayLike) -> ValueWithLimit:
+    """Mean of what is missing of each of several independent wholes, such as the markers of a pair.
+
+    The limit is that of a share with as many wholes missing as the parts make up, rounded up: no other law on [0, 1]
+    with that mean scatters more.
+
+    Args:
+        parts: (n,) shares missing, from 0 to 1.
+    """
+    shares = np.asarray(parts, dtype=np.float64)
+    # The rounding of sixteenths and the like must not add a whole.
+    return float(shares.mean()), share_limit(int(np.ceil(shares.sum() - 1e-9)), shares.size)[1]
+
+
 def percentile_limit(values: ArrayLike, percent: float) -> ValueWithLimit:
     """Percentile of absolute values, and the smallest order statistic that covers the true one with 95 %.
 
-    With too few values the largest one is used.
+    Of fewer than `log 0.05 / log(percent / 100)` values (299 for the 99th percentile) none does.
     """
     ordered = np.sort(np.abs(np.asarray(values, dtype=np.float64)))
     rank = int(binom.ppf(CONFIDENCE, ordered.size, percent / 100))
-    return float(np.percentile(ordered, percent)), float(ordered[min(rank, ordered.size - 1)])
+    limit = float(ordered[rank]) if rank < ordered.size else float("inf")
+    return float(np.percentile(ordered, percent)), limit
 
 
 def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> ValueWithLimit:
@@ -73,13 +90,6 @@ def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> ValueWithLimit:
     shares = blocks * (first / first.sum() - second / second.sum())
     error = shares.std(ddof=1) / np.sqrt(blocks)
     return ratio, ratio * float(np.exp(t.ppf(CONFIDENCE, blocks - 1) * error))
-
-
-def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> ValueWithLimit:
-    """Ratio of two root mean squares of normal errors, each given with the number of values."""
-    ratio = above[0] / below[0]
-    variance = sum(1 / (2 * count) for _, count in (above, below))
-    return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(variance)))
 
 
 def paired_rms_ratio_limit(above: float, below: float, correlation: float, count: int) -> ValueWithLimit:
@@ -191,7 +201,7 @@ class AcceptanceRow(BaseModel):
         quantity: what is measured, with its unit.
         low, high: required range; None means no lower end.
         measured: None where nothing could be measured.
-        limit_low, limit_high: one-sided 95 % limits of what is measured.
+        limit_low, limit_high: one-sided 95 % limits of what is measured; None where there are too few values for one.
         n: sample size.
         met: whether the limits lie within `low` and `high`; False where nothing could be measured.
         note: a remark for the reader, may be empty.
@@ -241,7 +251,8 @@ class AcceptanceTable(BaseModel):
         """The text of bars.md."""
         head = f"# Bars of tier {self.tier}, seed {self.seed}, droguekit {self.code_version}\n\n"
         numbered = sum(row.bar not in _WITHOUT_NUMBER for row in self.rows)
-        count = f"{numbered - self.missed} of {numbered} bars are met. Limits are one-sided, 95 %.\n\n"
+        met = f"{numbered - self.missed} of {numbered} bars are met."
+        count = f"{met} Limits are one-sided, 95 %, unless a note says otherwise.\n\n"
         lines = ["| " + " | ".join(cells) + " |" for cells in (_HEADINGS, ["---"] * len(_HEADINGS), *self._cells())]
         return head + count + "\n".join(lines) + "\n"
 
@@ -256,23 +267,38 @@ class AcceptanceTable(BaseModel):
 
 
 _WITHOUT_NUMBER = (GOAL, COMPARISON)
+_TOO_FEW = "too few values for a 95 % limit"
+TWO_SIDED = "ends of a two-sided 95 % interval"
+"""Note of limits that are one-sided at 97.5 %, as the benchmark gives them."""
 _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met", "note"]
 
 
 def at_most(
     bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = ""
 ) -> AcceptanceRow:
-    """A quantity that must not exceed `high`; `measured` is its value and upper limit."""
+    """A quantity that must not exceed `high`; `measured` is its value and upper limit, infinite with too few values."""
     value, limit = measured
     return AcceptanceRow(
-        bar=bar, quantity=quantity, high=high, measured=value, limit_high=limit, n=n, met=limit <= high, note=note
+        bar=bar,
+        quantity=quantity,
+        high=high,
+        measured=value,
+        limit_high=_finite(limit),
+        n=n,
+        met=limit <= high,
+        note=_with_reason(note, limit),
     )
 
 
 def between(
-    bar: str, quantity: str, wanted: tuple[float, float], measured: tuple[float, float, float], n: int
+    bar: str,
+    quantity: str,
+    wanted: tuple[float, float],
+    measured: tuple[float, float, float],
+    n: int,
+    note: str = "",
 ) -> AcceptanceRow:
-    """A quantity with a required range; `measured` is its value, lower and upper limit."""
+    """A quantity with a required range; `measured` is its value and limits, infinite with too few values."""
     (low, high), (value, limit_low, limit_high) = wanted, measured
     return AcceptanceRow(
         bar=bar,
@@ -280,11 +306,21 @@ def between(
         low=low,
         high=high,
         measured=value,
-        limit_low=limit_low,
-        limit_high=limit_high,
+        limit_low=_finite(limit_low),
+        limit_high=_finite(limit_high),
         n=n,
         met=low <= limit_low and limit_high <= high,
+        note=_with_reason(note, limit_high),
     )
+
+
+def _finite(limit: float) -> float | None:
+    return limit if np.isfinite(limit) else None
+
+
+def _with_reason(note: str, limit: float) -> str:
+    """The note, or the reason why there is no limit."""
+    return note if np.isfinite(limit) else "; ".join(part for part in (_TOO_FEW, note) if part)
 
 
 def not_measured(bar: str, quantity: str, high: float, note: str) -> AcceptanceRow:

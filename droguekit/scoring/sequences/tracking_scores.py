@@ -178,6 +178,11 @@ def overlap_row(tracks: Sequence[EyeTrack], chosen: Callable[[EyeTrack], NDArray
     )
 
 
+def has_found(position_error_m: Array, rim_radius_m: float) -> bool:
+    """Whether a pose has found the drogue again: its position (3,) errs by no more than the radius of the rim. [m]"""
+    return float(np.linalg.norm(position_error_m)) <= rim_radius_m
+
+
 def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]) -> Reacquisition:
     """How soon estimates come after the drogue was hidden, or had none beside the sun.
 

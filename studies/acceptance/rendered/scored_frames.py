@@ -223,12 +223,14 @@ class FrameErrors:
         pose: (5,) X, Y, Z [m], pitch and yaw [deg], estimate minus truth, or None without a pose.
         transverse_m: across the line of sight, 0 without a pose. [m]
         markers: of its centroids.
+        unmeasured_fraction: of its lit markers in view, both eyes together.
     """
 
     distance_m: float
     pose: Array | None
     transverse_m: float
     markers: MarkerErrors
+    unmeasured_fraction: float
 
 
 Frames = Mapping[int, FrameErrors]
@@ -261,8 +263,12 @@ def score_frames(dataset: Path, estimates: Path, methods: Iterable[str]) -> dict
                 errors.outward_px[marker],
                 bounds_px[errors.eye[marker], errors.feature[marker]],
             )
+            lit = truth.visible[:, : truth.layout.count] & np.isfinite(bounds_px)
+            unmeasured = lit.copy()
+            unmeasured[errors.eye[marker], errors.feature[marker]] = False
             pose, transverse_m = _pose(estimate, truth)
-            frames[index] = FrameErrors(truth.distance_m, pose, transverse_m, markers)
+            fraction = float(unmeasured.sum() / max(lit.sum(), 1))
+            frames[index] = FrameErrors(truth.distance_m, pose, transverse_m, markers, fraction)
     return scores
 
 
@@ -276,11 +282,6 @@ def _pose(estimate: object, truth: DrogueTruth) -> tuple[Array | None, float]:
 def between_m(frames: Frames, low_m: float, high_m: float) -> dict[int, FrameErrors]:
     """The frames whose distance lies in [low, high], with a hundredth of leeway for stations."""
     return {i: f for i, f in frames.items() if 0.99 * low_m <= f.distance_m <= 1.01 * high_m}
-
-
-def stacked_px(frames: Frames) -> Array:
-    """(K, 2) offsets of all markers. [px]"""
-    return np.concatenate([np.zeros((0, 2)), *(frame.markers.offset_px for frame in frames.values())])
 
 
 def pose_array(frames: Frames) -> Array:

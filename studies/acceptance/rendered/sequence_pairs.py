@@ -35,6 +35,7 @@ class TruePair:
         sequence_id: of its sequence; a pair that belongs to none is one of its own.
         family: of its conditions.
         truth: of the drogue.
+        rim_radius_m: of the drogue. [m]
         in_view: whether both images show four markers and the hub, if the drogue has one, and the sun dazzles neither.
         visibility: of the pair; `seen` for a single one.
     """
@@ -43,6 +44,7 @@ class TruePair:
     sequence_id: int
     family: str
     truth: DrogueTruth
+    rim_radius_m: float
     in_view: bool
     visibility: Visibility
 
@@ -100,8 +102,8 @@ def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
 
 def _true_pair(data: Dataset, index: int) -> TruePair | None:
     record = data.record(index)
-    truth, flown = drogue_truth(record), true_state(record)
-    if truth is None:
+    truth, flown, drogue = drogue_truth(record), true_state(record), record.frame.drogue
+    if truth is None or drogue is None:
         return None
     visibility: Visibility = "seen" if flown is None else flown.visibility
     markers = truth.visible[:, : truth.layout.count].sum(axis=1)
@@ -111,6 +113,7 @@ def _true_pair(data: Dataset, index: int) -> TruePair | None:
         sequence_id=index if record.sequence_id is None else record.sequence_id,
         family=record.conditions.family,
         truth=truth,
+        rim_radius_m=drogue.rim_radius_m,
         in_view=in_view and visibility != "dazzled",
         visibility=visibility,
     )

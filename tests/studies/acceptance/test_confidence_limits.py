@@ -44,6 +44,28 @@ def test_the_limit_of_a_percentile_covers_it_in_19_of_20_samples() -> None:
     assert covered >= 0.95 - 0.02
 
 
+@pytest.mark.parametrize(("percent", "fewest"), [(99.0, 299), (50.0, 5)])
+def test_too_few_values_give_a_percentile_no_limit(percent: float, fewest: int) -> None:
+    # As many values all lie below the percentile with (percent / 100)^n, which must not exceed 5 %.
+    assert (percent / 100) ** fewest <= 0.05 < (percent / 100) ** (fewest - 1)
+    values = rng(8).normal(size=fewest)
+    assert acceptance_table.percentile_limit(values, percent)[1] == np.abs(values).max()
+    assert acceptance_table.percentile_limit(values[1:], percent)[1] == np.inf
+
+
+def test_a_single_number_gives_a_mean_no_limit() -> None:
+    assert acceptance_table.mean_limit([3.0]) == (3.0, np.inf)
+
+
+def test_what_is_missing_of_pairs_counts_as_whole_pairs() -> None:
+    for missing, whole in ((0, 0), (1, 1), (16, 1), (17, 2)):
+        parts = np.zeros(100)
+        parts[: -(-missing // 8)] = [8 / 16] * (missing // 8) + [missing % 8 / 16] * (missing % 8 > 0)
+        share, limit = acceptance_table.partial_share_limit(parts)
+        assert share == pytest.approx(missing / 1600)
+        assert limit == acceptance_table.share_limit(whole, 100)[1]
+
+
 def test_the_limit_of_a_ratio_in_the_same_frames_covers_it_in_19_of_20_samples() -> None:
     draws = rng(4)
     place = draws.exponential(1.0, (4000, 40, 10))
@@ -69,16 +91,6 @@ def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None
     assert np.mean(limits) < 1.035 * np.sqrt(0.9)
 
 
-def test_the_limit_of_a_ratio_of_root_mean_squares_covers_it_in_19_of_20_samples() -> None:
-    above, below = rng(5).normal(0, 3.0, (4000, 200)), rng(6).normal(0, 1.0, (4000, 300))
-    limits = [
-        acceptance_table.rms_ratio_limit((np.sqrt(np.mean(a**2)), a.size), (np.sqrt(np.mean(b**2)), b.size))[1]
-        for a, b in zip(above, below, strict=True)
-    ]
-    # As above.
-    assert np.mean(np.array(limits) >= 3.0) == pytest.approx(0.95, abs=0.02)
-
-
 def test_the_limits_of_nees_hold_the_chi_square_quantiles() -> None:
     freedom = 2000
     value, low, high = acceptance_table.nees_limits(1.0, freedom)
@@ -93,6 +105,14 @@ def test_a_bar_is_met_when_its_limit_is_and_not_when_only_its_value_is() -> None
     assert between("9", "x", (0.85, 1.2), (1.0, 0.9, 1.1), 10).met
     assert not between("9", "x", (0.85, 1.2), (1.0, 0.8, 1.1), 10).met
     assert not not_measured("4", "x", 1.0, "why").met
+
+
+def test_a_bar_without_a_limit_is_not_met_and_says_so() -> None:
+    row = at_most("14", "x", 1.0, (0.1, np.inf), 20, "1 of 20 pairs without a pose")
+    assert (row.measured, row.limit_high, row.met) == (0.1, None, False)
+    assert row.note == "too few values for a 95 % limit; 1 of 20 pairs without a pose"
+    row = between("goal", "x", (0.85, 1.2), (1.0, -np.inf, np.inf), 20)
+    assert (row.limit_low, row.limit_high, row.met, row.note) == (None, None, False, "too few values for a 95 % limit")
 
 
 def test_the_table_counts_numbered_bars_and_shows_all() -> None:

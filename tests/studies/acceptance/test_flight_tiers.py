@@ -31,7 +31,8 @@ from studies.acceptance.rendered.scored_frames import BEST, CHAIN
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, TruePair
 from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 
-LAYOUT, RIG = marker_layout(load_drogue("red-8")), paper_rig()
+DROGUE, RIG = load_drogue("red-8"), paper_rig()
+LAYOUT = marker_layout(DROGUE)
 
 
 def true_pair(index: int, **changes: object) -> TruePair:
@@ -43,7 +44,7 @@ def true_pair(index: int, **changes: object) -> TruePair:
         centers_px=np.zeros((2, 9, 2)),
         visible=np.ones((2, 9), dtype=bool),
     )
-    return replace(TruePair(index, index // 50, "sky", truth, True, "seen"), **changes)  # type: ignore[arg-type]
+    return replace(TruePair(index, index // 50, "sky", truth, DROGUE.rim_radius_m, True, "seen"), **changes)  # type: ignore[arg-type]
 
 
 def answer(pair: TruePair, error_mm: float | None = 0.3, sd_m: float = 1e-3, **changes: object) -> ScoredPair:
@@ -161,12 +162,20 @@ def test_a_wrong_pose_beside_the_sun_or_of_a_part_is_counted(visibility: str) ->
     assert (row.measured, row.n, row.met) == (1, 1, False)
 
 
-def test_a_pose_that_is_far_off_has_not_found_the_drogue_again() -> None:
+@pytest.mark.parametrize("distance_m", [2.0, 10.0])
+@pytest.mark.parametrize(("error_mm", "late"), [(320.0, 0), (340.0, 1)])
+def test_a_pose_farther_off_than_the_rim_has_not_found_the_drogue_again(
+    distance_m: float, error_mm: float, late: int
+) -> None:
+    assert DROGUE.rim_radius_m == 0.33
     pairs = [
-        answer(true_pair(k, visibility="hidden" if k < 5 else "seen"), None if k < 5 else 600.0 if k < 20 else 1.0)
+        answer(
+            true_pair(k, distance_m=distance_m, visibility="hidden" if k < 5 else "seen"),
+            None if k < 5 else error_mm if k < 20 else 1.0,
+        )
         for k in range(30)
     ]
-    assert by_bar(lost_rows("data", {BEST: pairs}, False))["24"][0].measured == 1
+    assert by_bar(lost_rows("data", {BEST: pairs}, False))["24"][0].measured == late
 
 
 def test_the_bench_is_judged_at_its_worst_station() -> None:
