@@ -44,7 +44,7 @@ from studies.detector_comparison.peer_corpus import (
     training_length,
 )
 from studies.detector_comparison.peer_environment import peer_python, run_script, script_variables
-from studies.detector_comparison.peers import PEERS
+from studies.detector_comparison.peers import PEERS, ULTRALYTICS_STEP_IMAGES
 
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
@@ -70,7 +70,8 @@ class ComparisonOptions:
         ours: ONNX files of our detectors, trained before on the same corpus.
         image_passes: of each peer's training; with 0 peers are not trained, only timed.
         size_px: width and height of every network's input.
-        batch: images in a step of the peers' training.
+        batch: images that go through a peer at once in its training.
+        step_images: images in a step of the optimizer of ultralytics' networks.
         threads: of training and timing.
         rounds: of timing.
         device: on which the peers are trained, as their projects name it.
@@ -91,6 +92,7 @@ class ComparisonOptions:
     seed: int
     environment: Path
     peers: tuple[str, ...] = tuple(PEERS)
+    step_images: int = ULTRALYTICS_STEP_IMAGES
 
     def __post_init__(self) -> None:
         if self.image_passes < 0 or self.batch < 1 or self.threads < 1 or self.rounds < 1:
@@ -98,6 +100,8 @@ class ComparisonOptions:
                 "image_passes, batch, threads, rounds: must be positive, got "
                 f"{self.image_passes}, {self.batch}, {self.threads}, {self.rounds}"
             )
+        if self.step_images < 1:
+            raise ValueError(f"step_images: must be at least 1, got {self.step_images}")
         if unknown := [name for name in self.peers if name not in PEERS]:
             raise ValueError(f"--peer: must be one of {', '.join(PEERS)}, got {', '.join(unknown)}")
         if any(side < 32 or side % 32 for side in self.size_px):
@@ -244,6 +248,7 @@ def _peer_training(options: ComparisonOptions, out: Path, name: str, folder: Pat
         "fraction": length.fraction,
         "size_px": size_px,
         "batch": options.batch,
+        "step_images": options.step_images,
         "threads": options.threads,
         "device": options.device,
         "seed": options.seed,
@@ -316,7 +321,18 @@ def main(
     ] = None,
     image_passes: PassesOption = 40_000,
     size: SizeOption = "480x640",
-    batch: Annotated[int, typer.Option("--batch", min=1, help="Images in a step of the peers' training.")] = 16,
+    batch: Annotated[
+        int, typer.Option("--batch", min=1, help="Images that go through a peer at once in its training.")
+    ] = 16,
+    step_images: Annotated[
+        int,
+        typer.Option(
+            "--step-images",
+            min=1,
+            help="Images in a step of the optimizer of ultralytics' networks (its nbs); as many as --batch give it a "
+            "step for each batch, as our networks and those of libreyolo have.",
+        ),
+    ] = ULTRALYTICS_STEP_IMAGES,
     threads: ThreadsOption = 2,
     rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 50,
     device: DeviceOption = "cpu",
@@ -350,6 +366,7 @@ def main(
             seed=seed,
             environment=environment or out / "environment",
             peers=tuple(peer or PEERS),
+            step_images=step_images,
         )
         rows = compare_peers(options, out, print_status)
     except (ValueError, OSError) as error:

@@ -14,6 +14,9 @@ ULTRALYTICS_SCRIPT, LIBREYOLO_SCRIPT = (
     Path(__file__).with_name(f"{package}_script.py") for package in ("ultralytics", "libreyolo")
 )
 
+ULTRALYTICS_STEP_IMAGES = 64
+"""Images whose gradients ultralytics sums up for a step of its optimizer, by default: `nbs`."""
+
 
 @dataclass(frozen=True)
 class Peer:

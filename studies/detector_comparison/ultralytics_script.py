@@ -2,9 +2,9 @@
 
 Run as a file, with its task as JSON on standard input.
 
-Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "size_px", "batch", "threads", "device",
-"seed"}` and `{"do": "export", "config", "weights", "file", "size_px"}`. Without weights an untrained network is
-exported.
+Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "size_px", "batch", "step_images", "threads",
+"device", "seed"}` and `{"do": "export", "config", "weights", "file", "size_px"}`. Without weights an untrained network
+is exported.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ def train(yolo: Any, task: dict[str, Any]) -> None:
         fraction=task["fraction"],
         imgsz=max(task["size_px"]),
         batch=task["batch"],
+        nbs=task["step_images"],
         device=task["device"],
         seed=task["seed"],
         workers=min(2, task["threads"]),

@@ -21,7 +21,7 @@ from nav.detector.input_image import network_input
 from studies.detector_comparison.peer_corpus import training_image_count, training_length
 from studies.detector_comparison.peer_detector import open_session
 from studies.detector_comparison.peer_environment import peer_python, run_script, script_variables
-from studies.detector_comparison.peers import ULTRALYTICS_SCRIPT
+from studies.detector_comparison.peers import ULTRALYTICS_SCRIPT, ULTRALYTICS_STEP_IMAGES
 from studies.learned_pose.keypoint_corpus import EyeSample, split_samples
 from studies.learned_pose.keypoint_crops import (
     CROP_PX,
@@ -50,7 +50,7 @@ class YoloTraining:
 
     Attributes:
         image_passes: rounded to whole epochs.
-        batch: images in a step.
+        batch: images that go through the network at once.
         threads: that it may use.
         seed: of the training.
         environment: folder of ultralytics' virtual environment.
@@ -144,6 +144,7 @@ def train_yolo(corpus: Path, out: Path, training: YoloTraining, say: Callable[[s
             "fraction": length.fraction,
             "size_px": (CROP_PX, CROP_PX),
             "batch": training.batch,
+            "step_images": ULTRALYTICS_STEP_IMAGES,
             "threads": training.threads,
             "device": "cpu",
             "seed": training.seed,

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -51,6 +52,7 @@ from studies.detector_comparison.peer_corpus import (
 )
 from studies.detector_comparison.peer_environment import run_script
 from studies.detector_comparison.peers import PEERS
+from studies.detector_comparison.ultralytics_script import train
 from tests.support.detector_networks import write_maps_network, write_rows_network
 
 
@@ -185,6 +187,14 @@ def test_a_training_without_images_is_refused() -> None:
 SCRIPTS = sorted({peer.script for peer in PEERS.values()})
 
 
+def test_a_step_of_ultralytics_takes_as_many_images_as_the_task_says(tmp_path: Path) -> None:
+    asked: list[dict[str, Any]] = []
+    yolo = SimpleNamespace(train=lambda **settings: asked.append(settings))
+    task = {"config": "c", "data": "d", "folder": str(tmp_path), "epochs": 2, "fraction": 1.0, "size_px": [64, 64]}
+    train(lambda config: yolo, {**task, "batch": 4, "step_images": 8, "threads": 1, "device": "cpu", "seed": 0})
+    assert (asked[0]["batch"], asked[0]["nbs"]) == (4, 8)
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_an_error_of_a_script_names_the_log_and_its_last_line(script: Path, tmp_path: Path) -> None:
     task = {"do": "export", "config": "d-fine-n", "weights": None, "size_px": [64, 64]}
@@ -227,6 +237,8 @@ def test_every_peer_gets_its_own_task_and_pictures_of_its_input(
         assert training["size_px"] == export["size_px"] == size_px
         # Of four images to train on ten passes are two epochs; Python rounds halves to even numbers.
         expected = {"do": "train", "epochs": 2, "fraction": 1.0, "batch": 4, "threads": 1, "device": "cpu", "seed": 0}
+        # The default of ultralytics, whatever the batch; libreyolo takes a step for each batch.
+        expected["step_images"] = 64
         assert {key: training[key] for key in expected} == expected
         pictures = list((Path(training["data"]).parent / "images" / "train").iterdir())
         assert len(pictures) == 4 and cv2.imread(str(pictures[0])).shape == (size_px[1], size_px[0], 3)
@@ -243,7 +255,8 @@ def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_pat
     out.mkdir()
     (out / "settings.json").write_text(json.dumps({"image_passes": "7"}))
     with pytest.raises(
-        ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px, test"
+        ValueError,
+        match="holds a comparison with another batch, corpus, image_passes, seed, size_px, step_images, test",
     ):
         compare_peers(order(screen_dataset, tmp_path), out, print)
     (out / "settings.json").write_text("[1]")
