@@ -60,11 +60,10 @@ class SizeRatio:
     ratio: float
     interval: Interval | None
 
-    @property
-    def outside(self) -> float:
-        """Distance of 1 from the interval; 0 inside."""
-        low, high = self.interval or (self.ratio, self.ratio)
-        return max(low - 1.0, 1.0 - high, 0.0)
+    def beyond(self, low: float, high: float) -> float:
+        """By how much the interval reaches beyond a range; 0 inside, infinite without an interval."""
+        ends = self.interval or (-np.inf, np.inf)
+        return max(low - ends[0], ends[1] - high, 0.0)
 
 
 @dataclass(frozen=True)
@@ -80,6 +79,11 @@ class MeanDifference:
     of: str
     mean: float
     reach: float
+
+
+def share_with_poses(stations: Sequence[PairedErrors]) -> float:
+    """Share of the pairs in which both engines' images gave a pose; others have no error that could be compared."""
+    return sum(len(s.one) for s in stations) / sum(s.pairs for s in stations)
 
 
 def size_ratios(stations: Sequence[PairedErrors]) -> list[SizeRatio]:
