@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Sequence
@@ -11,8 +12,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from scipy.stats import t
 
 from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.storage.reader import Dataset
 from droguekit.scoring.detection.detection_metrics import Evaluation
 from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
 from droguekit.scoring.results.detection_result import DetectedBox, image_id_of, read_detections
@@ -22,8 +25,6 @@ from studies.droguekit_command import run_droguekit
 RECIPE = Path(__file__).with_name("loop.toml")
 ARMS = ("even", "mined")
 EDGES_M = (2.0, 8.0, 16.0, 28.0, 40.0)
-# Student's t for the 95 % interval of the mean, by the number of seeds.
-_T_975 = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}
 _FAMILIES = ("day", "low-sun", "dusk", "haze")
 
 
@@ -50,9 +51,21 @@ def make_corpora(out: Path, test_pairs: int, workers: int) -> None:
 def train_and_detect(
     out: Path, name: str, corpora: Sequence[str], dataset: str, passes: int, seed: int, start: str | None = None
 ) -> Path:
-    """Train on corpora unless that is done, from given weights or from the start, and write the boxes in a dataset."""
+    """Train on corpora unless that is done, from given weights or from the start, and write the boxes in a dataset.
+
+    Raises:
+        ValueError: the folder of the training holds another one.
+        OSError: a command failed; names the log.
+    """
     folder = out / "trainings" / f"{name}-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
+    made_from = {
+        "passes": passes,
+        "corpora": [Dataset(out / corpus).manifest.dataset_sha256 for corpus in corpora],
+        "pictures": Dataset(out / dataset).manifest.dataset_sha256,
+        "weights": None if start is None else _weights_name(start),
+    }
+    _check_made_from(folder, made_from)
     boxes = folder / f"{dataset}.json"
     if not boxes.is_file():
         words: list[object] = ["--variant", "s", "--image-passes", passes, "--size", "192x256", "--seed", seed]
@@ -65,6 +78,22 @@ def train_and_detect(
         found = folder / "detector.onnx"
         run_droguekit("detect", out / dataset, "--detector", found, "--out", boxes, log=log)
     return boxes
+
+
+def _weights_name(start: str) -> str:
+    """Hash of a file of weights, or the name of shipped ones."""
+    file = Path(start)
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else start
+
+
+def _check_made_from(folder: Path, made_from: dict[str, object]) -> None:
+    """Record in an empty folder what its training is made from, and refuse one that holds another training."""
+    file, text = folder / "made-from.json", json.dumps(made_from, indent=1) + "\n"
+    if file.is_file() and file.read_text(encoding="utf-8") == text:
+        return
+    if any(folder.iterdir()):
+        raise ValueError(f"{folder}: holds a training with other {', '.join(made_from)}; give another --out")
+    write_text_atomic(file, text)
 
 
 def detected(out: Path, detector: str, dataset: str) -> Path:
@@ -122,16 +151,18 @@ def table(scores: dict[str, list[dict[str, float]]], whole: dict[str, list[float
 
 
 def _interval(differences: Array) -> str:
-    if len(differences) not in _T_975:
+    count = len(differences)
+    if count < 2:
         return ""
-    half = _T_975[len(differences)] * differences.std(ddof=1) / np.sqrt(len(differences))
+    half = float(t.ppf(0.975, count - 1)) * differences.std(ddof=1) / np.sqrt(count)
     return f", 95 % interval {differences.mean() - half:+.1f} to {differences.mean() + half:+.1f}"
 
 
 def main(
-    out: Annotated[Path, typer.Option("--out", help="Folder; what is found there is not made again.")] = Path(
-        "out/mining-loop"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option("--out", help="Folder; what is found there is not made again, and must be of the same options."),
+    ] = Path("out/mining-loop"),
     image_passes: Annotated[int, typer.Option("--image-passes", min=1, help="Of each training.")] = 1000,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Trainings of each arm.")] = 3,
     further_passes: Annotated[
@@ -146,6 +177,8 @@ def main(
 ) -> None:
     """Render, train, detect, mine, render what was asked for, train both ways, and print the table."""
     try:
+        if start_from is not None and further_passes is not None:
+            raise ValueError("--start-from, --further-passes: give one of them; each says what to train on from")
         out.mkdir(parents=True, exist_ok=True)
         make_corpora(out, test_pairs, workers)
         name = f"mined-{round(100 * kept)}" if start_from is None else f"mined-{round(100 * kept)}-{start_from}"
@@ -169,7 +202,7 @@ def main(
             for arm, corpus in arms.items():
                 name, passes, start = corpus, image_passes, None
                 if start_from is not None:
-                    name, start = f"{arm}-from-{start_from}", start_from
+                    name, start = f"{corpus}-from-{start_from}", start_from
                 elif further_passes is not None:
                     name, passes = f"{corpus}-further", further_passes
                     start = str(trial.with_name("best.pt"))
