@@ -5,24 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
 from datasets_manifest.atomic import write_text_atomic
+from studies.stored_figures import code_fingerprint
 
-_MAKE_RESULTS = {".py", ".onnx"}
 _ROOMS = ("geometry", "drogue_models", "nav", "studies.acceptance", "droguekit.scoring")
 
 
-def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:
-    """Hash of the sources and networks that determine results."""
-    digest = hashlib.sha256()
-    for room in rooms:
-        folder = Path(str(files(room)))
-        for path in sorted(path for path in folder.rglob("*") if path.suffix in _MAKE_RESULTS):
-            digest.update(f"{room}/{path.relative_to(folder).as_posix()}\0".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+def results_fingerprint() -> str:
+    """Hash of the sources and networks that determine results of drawn centroids."""
+    return code_fingerprint(_ROOMS)
 
 
 # Packages between the pixels and the estimates, readers and file formats included.

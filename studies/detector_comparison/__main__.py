@@ -45,6 +45,7 @@ from studies.detector_comparison.peer_corpus import (
 )
 from studies.detector_comparison.peer_environment import peer_python, run_script, script_variables
 from studies.detector_comparison.peers import PEERS, ULTRALYTICS_STEP_IMAGES
+from studies.wrong_input import wrong_input_ends
 
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
@@ -352,7 +353,7 @@ def main(
 
     With 0 image passes nothing is trained or scored: only parameters, operations and times are measured.
     """
-    try:
+    with wrong_input_ends("detector_comparison"):
         options = ComparisonOptions(
             corpus=corpus,
             test=test or corpus,
@@ -369,9 +370,6 @@ def main(
             step_images=step_images,
         )
         rows = compare_peers(options, out, print_status)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
     typer.echo("\n".join(comparison_lines(rows)))
     typer.echo(f"the numbers are in {out / 'comparison.json'}")
 

@@ -34,6 +34,7 @@ from studies.detector_comparison.options import (
     print_status,
 )
 from studies.droguekit_command import run_droguekit
+from studies.wrong_input import wrong_input_ends
 
 
 class SingleViewDetector(OnnxDetector):
@@ -265,7 +266,7 @@ def main(
     rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 30,
 ) -> None:
     """Train variants of our network that differ in one thing, for the same image passes; measure scores and times."""
-    try:
+    with wrong_input_ends("ablation"):
         options = AblationOptions(
             corpus,
             test or corpus,
@@ -279,9 +280,6 @@ def main(
             tuple(network or (LEARNING if learning else PARTS)),
         )
         lines = ablate(options, out, print_status)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
     typer.echo("\n".join(lines))
 
 

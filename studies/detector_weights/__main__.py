@@ -22,6 +22,7 @@ from studies.detector_weights.plain_grounds import write_plain_grounds
 from studies.detector_weights.public_photographs import TEST_PACKAGES, TRAINING_PACKAGES, fetch_photographs
 from studies.droguekit_command import run_droguekit
 from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind, scores_side_by_side
+from studies.wrong_input import wrong_input_ends
 
 
 def make_weights(variant: str, out: Path, workers: int, device: str) -> Path:
@@ -81,7 +82,7 @@ def main(
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 2,
 ) -> None:
     """Make weights of a detector and print hashes and scores."""
-    try:
+    with wrong_input_ends("detector_weights"):
         new = make_weights(variant, out, workers, device)
         for name in datasets(variant):
             typer.echo(f"{name}: {Dataset(out / name).manifest.dataset_sha256}")
@@ -90,9 +91,6 @@ def main(
         assert shipped is not None
         for line in score_lines(out, {"shipped": shipped, "new": new}):
             typer.echo(line)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from render.camera.sensor import expose
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.camera_sampling import camera_of_scene
 from scenes.sampler import sample_frame
+from studies.wrong_input import wrong_input_ends
 
 _PATCH_PX = 16
 # The calmest patches of a picture show its noise.
@@ -172,40 +173,48 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cost = commands.add_parser("cost", help="CPU time of an image of 1024 x 768")
     cost.add_argument("--scenes", type=int, default=20, metavar="N", help="cameras to time (default 20)")
     options = parser.parse_args(arguments)
-    if options.command == "measure":
-        print("folder | " + " | ".join(field.name for field in fields(PictureMeasures)))
-        for folder in options.folders:
-            found = astuple(measure_pictures(shown_pictures(folder)))
-            print(f"{folder.name} | {found[0]} | " + " | ".join(f"{value:.3f}" for value in found[1:]), flush=True)
-    elif options.command == "redraw":
-        _redraw(Dataset(options.dataset), options.out)
-    else:
-        _time(options.scenes)
+    with wrong_input_ends("drawn_cameras"):
+        if options.command == "measure":
+            _measure(options.folders)
+        elif options.command == "redraw":
+            _redraw(Dataset(options.dataset), options.out)
+        else:
+            _time(options.scenes)
+
+
+def _measure(folders: Sequence[Path]) -> None:
+    print("folder | " + " | ".join(field.name for field in fields(PictureMeasures)))
+    for folder in folders:
+        found = astuple(measure_pictures(shown_pictures(folder)))
+        print(f"{folder.name} | {found[0]} | " + " | ".join(f"{value:.3f}" for value in found[1:]), flush=True)
 
 
 def shown_pictures(folder: Path) -> Iterator[NDArray[np.uint8]]:
     """Left images of a dataset, on the sRGB curve, or the pictures of a folder.
 
     Raises:
-        ValueError: a picture cannot be read; names it.
+        ValueError: there are none, or a picture cannot be read; names folder or file.
+        OSError: there is no such folder.
     """
     if (folder / MANIFEST_FILE).exists():
         source = Dataset(folder)
         yield from (display_picture(source.images(index)) for index in source.frame_indices)
         return
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in _PICTURES:
-            picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if picture is None:
-                raise ValueError(f"{path}: is no picture that OpenCV reads")
-            yield np.asarray(picture[..., ::-1], dtype=np.uint8)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
+    if not paths:
+        raise ValueError(f"{folder}: has no dataset and no pictures; give a folder with {', '.join(_PICTURES)}")
+    for path in paths:
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise ValueError(f"{path}: is no picture that OpenCV reads")
+        yield np.asarray(picture[..., ::-1], dtype=np.uint8)
 
 
 def _redraw(source: Dataset, out: Path) -> None:
     """Take pixel values for light: what was clipped is a third brighter, and noise and blur are doubled."""
     recipe = source.manifest.recipe
     if recipe.sensor.encoding != "linear":
-        raise SystemExit(f"{source.path}: its images are not linear, and say less about the light")
+        raise ValueError(f"{source.path}: its images are not linear, and say less about the light")
     sensor = recipe.sensor.model_copy(update={"encoding": "gamma", "output_bits": 8})
     with_cameras = recipe.model_copy(update={"camera": CameraRanges(), "sensor": sensor})
     out.mkdir(parents=True, exist_ok=True)
@@ -243,6 +252,8 @@ def _both_eyes(light: NDArray[np.float32]) -> StereoRadiance:
 
 def _time(scenes: int) -> None:
     """CPU time of images of smooth noise, with and without drawn cameras; the first pair compiles and is left out."""
+    if scenes < 1:
+        raise ValueError(f"--scenes: must be at least 1, got {scenes}")
     cv2.setNumThreads(1)
     width, height = _COST_SIZE_PX
     rig = {"preset": "rgb-ideal", "encoding": "gamma", "width_px": width, "height_px": height, "focal_px": 1706.67}

@@ -69,6 +69,7 @@ from studies.engine_agreement.paired_frames import (
     recipe_of_family,
     write_sky_recipe,
 )
+from studies.wrong_input import wrong_input_ends
 
 Result = dict[str, Any]
 
@@ -259,7 +260,7 @@ def main(
     run = ComparisonRun(out, Engines(engine), seed, typer.echo)
     tables: dict[str, Any] = {}
     requirements: list[Requirement] = []
-    try:
+    with wrong_input_ends("engine_agreement"):
         if ComparisonPart.FRAMES in chosen:
             families = family or [*FAMILIES, str(write_sky_recipe(out / "own-sky"))]
             frames = paired_frames(families, station or STATIONS_M, count or len(families), samples, seed)
@@ -281,9 +282,6 @@ def main(
         if ComparisonPart.NAVIGATION in chosen:
             requirements += _navigation(out / "navigation", engine, seed, pairs, tables)
         write_json(out, tables, requirements)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
     typer.echo("\n".join([*requirement_lines(requirements), f"numbers and pictures are in {out}"]))
     raise typer.Exit(0 if all(requirement.reached for requirement in requirements) else 1)
 

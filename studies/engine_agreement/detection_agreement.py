@@ -15,6 +15,7 @@ from datasets_manifest.recipe.recipe import load_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind, scores_side_by_side
+from studies.wrong_input import wrong_input_ends
 
 TEST_SET = Path(__file__).parents[1] / "detector_weights" / "test.toml"
 
@@ -44,15 +45,12 @@ def main(
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
 ) -> None:
     """Render by both engines, and print a table of scores by the kind of drogue for each detector."""
-    try:
+    with wrong_input_ends("detection_agreement"):
         folders = render_by_engines(out, recipe, engine, pairs, workers)
         for name in detector or ["mobile-l", "mobile-s"]:
             print(f"\n{name}\n")
             scores = {by: list(score_by_kind(folder, name, drogue_kind)) for by, folder in folders.items()}
             print("\n".join(scores_side_by_side(scores)), flush=True)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import typer
 from studies.engine_agreement.detection_agreement import render_by_engines
 from studies.short_training import train_briefly
 from studies.world_variety.detection_by_kind import drogue_kind, percent, score_by_kind, scores_side_by_side
+from studies.wrong_input import wrong_input_ends
 
 
 def main(
@@ -26,7 +27,7 @@ def main(
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
 ) -> None:
     """Render by both engines, train on either, and print a table of scores on the test set for each seed."""
-    try:
+    with wrong_input_ends("training_agreement"):
         folders = render_by_engines(out, recipe, engine, pairs, workers)
         for each in seed or [0]:
             scores = {}
@@ -38,9 +39,6 @@ def main(
             print(
                 "AP of all:", ", ".join(f"{name} {percent(rows[-1].ap)}" for name, rows in scores.items()), flush=True
             )
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
 
 
 if __name__ == "__main__":

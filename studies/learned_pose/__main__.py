@@ -44,6 +44,7 @@ from studies.learned_pose.keypoint_corpus import eye_sample, keypoint_sigma_px, 
 from studies.learned_pose.keypoint_training import SimccTraining, train_simcc
 from studies.learned_pose.position_scores import PairScores, missing_lines, score_pair, table_lines
 from studies.learned_pose.yolo_pose import YoloPose, YoloTraining, train_yolo
+from studies.wrong_input import wrong_input_ends
 
 _HERE = Path(__file__).parent
 _TITLES = {
@@ -155,7 +156,7 @@ def main(
     """Render, train, and print errors of all estimators by distance."""
     yolo = YoloTraining(yolo_passes, 16, threads, seed, environment or out / "peers")
     options = StudyOptions(workers, yolo, SimccTraining(simcc_passes, threads=threads, seed=seed))
-    try:
+    with wrong_input_ends("learned_pose"):
         pairs = compare(options, out)
         for name, digest in hashes(out).items():
             typer.echo(f"{name}: {digest}")
@@ -164,9 +165,6 @@ def main(
         typer.echo("\n".join(("", *missing_lines(pairs, ESTIMATORS))))
         write_error_plot(pairs, out / "errors.png")
         typer.echo(f"wrote {out / 'errors.png'}")
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
 
 
 if __name__ == "__main__":

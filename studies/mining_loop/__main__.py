@@ -21,6 +21,7 @@ from droguekit.scoring.detection.detection_truth import ImageTruth, read_detecti
 from droguekit.scoring.results.detection_result import DetectedBox, image_id_of, read_detections
 from geometry.se3 import Array
 from studies.droguekit_command import run_droguekit
+from studies.wrong_input import wrong_input_ends
 
 RECIPE = Path(__file__).with_name("loop.toml")
 ARMS = ("even", "mined")
@@ -176,7 +177,7 @@ def main(
     workers: Annotated[int, typer.Option("--workers", min=1, help="That render.")] = 1,
 ) -> None:
     """Render, train, detect, mine, render what was asked for, train both ways, and print the table."""
-    try:
+    with wrong_input_ends("mining_loop"):
         if start_from is not None and further_passes is not None:
             raise ValueError("--start-from, --further-passes: give one of them; each says what to train on from")
         out.mkdir(parents=True, exist_ok=True)
@@ -215,9 +216,6 @@ def main(
             before = cell_scores(out / "test", detected(out, start_from, "test"))
             typer.echo(f"{start_from} as it is: " + ", ".join(f"{cell} {ap50:.1f}" for cell, ap50 in before.items()))
         write_text_atomic(out / "scores.json", json.dumps({"cells": scores, "all": whole}, indent=1) + "\n")
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
     typer.echo("\n".join(table(scores, whole)))
 
 

@@ -1,20 +1,18 @@
 """`python -m studies.render_cost`: cost of a stereo pair by our renderer and by plain Cycles and Mitsuba scripts.
 
-The numbers of each distance are kept on disk.
+The numbers of each distance are kept on disk, and used again for the same options, code and machine.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from datasets_manifest.atomic import write_text_atomic
+from droguekit.batch.progress import ProgressReport, progress_report
 from droguekit.batch.worker_pool import run_in_own_process
 from studies.render_cost.noise_search import (
     SCENES,
@@ -23,6 +21,8 @@ from studies.render_cost.noise_search import (
     RenderCost,
 )
 from studies.render_cost.renderers import measure_own_path, measure_plain_cycles, measure_plain_mitsuba
+from studies.stored_figures import read_results, rendering_build, write_results
+from studies.wrong_input import wrong_input_ends
 
 OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
 _EXAMPLES = """Examples:
@@ -32,53 +32,61 @@ _EXAMPLES = """Examples:
   python -m studies.render_cost --station 10 --station 40 --full-samples 4"""
 
 
-def compare_at(
-    distance_m: float, seed: int, repeat: int, full_samples: int | None, say: Callable[[str], None]
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class CostOptions:
+    """What the figures of a distance depend on besides code and machine.
+
+    Attributes:
+        seed: of the frames.
+        repeat: number of pairs over which our own cost is averaged.
+        full_samples: most samples of Cycles over every pixel, or None without a limit.
+    """
+
+    seed: int
+    repeat: int
+    full_samples: int | None
+
+
+def compare_at(distance_m: float, options: CostOptions, report: ProgressReport) -> dict[str, Any]:
     """Noise and cost of a pair by all renderers at one distance.
 
     Args:
         distance_m: of the drogue. [m]
-        seed: of the frames.
-        repeat: number of pairs over which our own cost is averaged.
-        full_samples: most samples of Cycles over every pixel, or None without a limit.
-        say: called with a line about progress.
+        options: of the measurement.
+        report: is told of the progress.
 
     Raises:
         ValueError: Mitsuba or Blender is missing.
         OSError: a process ended.
     """
-    say(f"{distance_m:g} m: {OWN}")
-    own, own_cost, view = run_in_own_process(partial(measure_own_path, distance_m, seed, repeat))
+    report.say(f"{distance_m:g} m: {OWN}")
+    own, own_cost, view = run_in_own_process(partial(measure_own_path, distance_m, options.seed, options.repeat))
     rows = {OWN: _row(own, own_cost)}
-    say(f"{distance_m:g} m: {MITSUBA}, to reach a noise of {own.noise:.1%}")
+    report.say(f"{distance_m:g} m: {MITSUBA}, to reach a noise of {own.noise:.1%}")
     rows[MITSUBA] = _row(*run_in_own_process(partial(measure_plain_mitsuba, view, own.noise)))
-    say(f"{distance_m:g} m: {CYCLES}, to reach a noise of {own.noise:.1%}")
-    rows[CYCLES] = _row(*measure_plain_cycles(view, own.noise, full_samples))
-    return {"schema": 1, "distance_m": distance_m, "seed": seed, "full_samples": full_samples, "renderers": rows}
+    report.say(f"{distance_m:g} m: {CYCLES}, to reach a noise of {own.noise:.1%}")
+    rows[CYCLES] = _row(*measure_plain_cycles(view, own.noise, options.full_samples))
+    return {"distance_m": distance_m, "renderers": rows}
 
 
 def _row(noise: NoiseEstimate, cost: RenderCost) -> dict[str, Any]:
     return asdict(noise) | asdict(cost)
 
 
-def station_file(out: Path, distance_m: float) -> Path:
-    """File of the results at a distance."""
-    return out / f"{distance_m:g}m.json"
+def stored_station(out: Path, distance_m: float, options: CostOptions, report: ProgressReport) -> dict[str, Any]:
+    """The figures at a distance, measured unless the same options, code and machine measured them before.
 
-
-def write_station(out: Path, found: dict[str, Any]) -> None:
-    """Store the results at a distance; the file is written completely or not at all."""
-    write_text_atomic(station_file(out, found["distance_m"]), json.dumps(found, indent=1) + "\n")
-
-
-def read_station(out: Path, distance_m: float, seed: int, full_samples: int | None) -> dict[str, Any] | None:
-    """Stored results at a distance with this seed and limit, or None."""
-    file = station_file(out, distance_m)
-    if not file.exists():
-        return None
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found if (found["seed"], found["full_samples"]) == (seed, full_samples) else None
+    Raises:
+        ValueError: Mitsuba or Blender is missing, or stored figures are damaged.
+        OSError: a process ended, or a file cannot be written.
+    """
+    file, name = out / f"{distance_m:g}m.json", f"{distance_m:g} m"
+    made_by = {"options": asdict(options), **rendering_build(("studies.render_cost",))}
+    known = read_results(file, made_by, report)
+    if name not in known:
+        known[name] = compare_at(distance_m, options, report)
+        write_results(file, known, made_by)
+    return known[name]
 
 
 def table_lines(stations: list[dict[str, Any]]) -> list[str]:
@@ -107,7 +115,8 @@ def _ratio(row: dict[str, Any], own: dict[str, Any]) -> str:
 
 def main(
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for the numbers; distances that are there are kept.")
+        Path,
+        typer.Option("--out", help="Folder for the numbers; those of the same options, code and machine are kept."),
     ] = Path("out/peer-comparison"),
     station: Annotated[list[float] | None, typer.Option("--station", help="A distance in metres; repeatable.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the frames.")] = 1,
@@ -122,17 +131,9 @@ def main(
     ] = None,
 ) -> None:
     """Measure CPU seconds of a stereo pair by our renderer, plain Cycles with OIDN and plain Mitsuba at equal noise."""
-    stations = []
-    try:
-        for distance_m in station or STATIONS_M:
-            found = read_station(out, distance_m, seed, full_samples)
-            if found is None:
-                found = compare_at(distance_m, seed, repeat, full_samples, lambda line: typer.echo(line, err=True))
-                write_station(out, found)
-            stations.append(found)
-    except (ValueError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
+    options = CostOptions(seed, repeat, full_samples)
+    with wrong_input_ends("render_cost"):
+        stations = [stored_station(out, metres, options, progress_report()) for metres in station or STATIONS_M]
     typer.echo("\n".join(table_lines(stations)))
     typer.echo(f"samples after each cost; * by the square-root law from fewer; numbers are in {out}")
 

@@ -1,7 +1,7 @@
 """Measures speed-up and overhead of several workers: two against one, and the cost of a frame besides its rendering.
 
 Run as `python -m studies.scaling --out out/scaling` on a machine that does nothing else. A stopped run
-continues: results in `results.json` of that folder are not measured again.
+continues: results in `results.json` of that folder by the same code and machine are not measured again.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.layout import EVENTS_FILE
 from droguekit.batch.execution import ExecutionOptions, resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport, progress_report
 from droguekit.batch.render_dataset import EventLog, make_frames
+from studies.stored_figures import RENDER_COMMAND, read_results, rendering_build, write_results
+from studies.wrong_input import wrong_input_ends
 
 EMPTY_RECIPE = """
 name = "empty"
@@ -267,13 +268,15 @@ def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: P
         report: of progress.
 
     Returns:
-        All results in the folder by their names.
+        All results of this code and machine in the folder by their names; others are left out.
 
     Raises:
+        ValueError: the results in the folder are damaged; names the file.
         OSError: a process failed, or the folder cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    known = _known(out / RESULTS_FILE)
+    build = rendering_build(RENDER_COMMAND)
+    known = read_results(out / RESULTS_FILE, build, report)
     recipe_text = UNIFORM_RECIPE.format(pairs=pairs)
     planned: dict[str, tuple[str, Callable[[], Mapping[str, Any]]]] = {
         f"{pairs} pairs, 1 worker": ("speed", lambda: speed(recipe_text, 1, out / "one", report)),
@@ -292,7 +295,7 @@ def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: P
                 f"the machine is busy with other work (load {load:.1f}): of the following results only CPU time counts"
             )
         known[name] = dict(work())
-        write_text_atomic(out / RESULTS_FILE, json.dumps(known, indent=1) + "\n")
+        write_results(out / RESULTS_FILE, known, build)
     return known
 
 
@@ -320,13 +323,6 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _known(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        return {}
-
-
 def main() -> int:
     """Measure, and print all that is known."""
     parser = argparse.ArgumentParser(prog="python -m studies.scaling", description=__doc__)
@@ -337,13 +333,11 @@ def main() -> int:
     parser.add_argument("--part", action="append", choices=parts, help="only this one; may be repeated")
     arguments = parser.parse_args()
     try:
-        if arguments.pairs < 1 or arguments.frames < 1:
-            raise ValueError("--pairs, --frames: must be at least 1")
-        wanted = tuple(arguments.part or parts)
-        results = measure(arguments.out, arguments.pairs, arguments.frames, wanted, progress_report())
-    except (ValueError, OSError) as error:
-        print(f"scaling: error: {error}", file=sys.stderr)
-        return 2
+        with wrong_input_ends("scaling"):
+            if arguments.pairs < 1 or arguments.frames < 1:
+                raise ValueError("--pairs, --frames: must be at least 1")
+            wanted = tuple(arguments.part or parts)
+            results = measure(arguments.out, arguments.pairs, arguments.frames, wanted, progress_report())
     except KeyboardInterrupt:
         print("scaling: interrupted; the same command continues from the finished results", file=sys.stderr)
         return 130

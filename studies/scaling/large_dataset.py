@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from datasets_manifest.atomic import part_path, write_text_atomic
+from datasets_manifest.atomic import part_path
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage.layout import RECIPE_FILE, RECORD_FILE, frame_folder
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
@@ -28,6 +28,8 @@ from droguekit.batch.render_dataset import render_dataset
 from droguekit.batch.resume import open_dataset
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
+from studies.stored_figures import RENDER_COMMAND, read_results, rendering_build, write_results
+from studies.wrong_input import wrong_input_ends
 
 RESULTS_FILE = "large.json"
 PAIRS = 40
@@ -174,11 +176,12 @@ def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressRe
         The costs that are known for this number of pairs.
 
     Raises:
+        ValueError: the results beside the dataset are damaged; names the file.
         OSError: a command failed, or the folder cannot be written.
     """
     results = dataset.parent / RESULTS_FILE
-    saved = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
-    known = {key: CommandCost(**cost) for key, cost in saved.items()}
+    build = rendering_build(RENDER_COMMAND)
+    known = {key: CommandCost(**cost) for key, cost in read_results(results, build, report).items()}
     commands = _commands(dataset, dataset.parent / f"{records}-made")
     for name, arguments in commands.items():
         if (only and name not in only) or f"{records} {name}" in known:
@@ -187,8 +190,7 @@ def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressRe
             shutil.rmtree(arguments[-1], ignore_errors=True)
         report.say(f"{name} of {records} pairs")
         known[f"{records} {name}"] = command_cost(records, name, arguments)
-        text = json.dumps({key: asdict(cost) for key, cost in known.items()}, indent=1)
-        write_text_atomic(results, text + "\n")
+        write_results(results, {key: asdict(cost) for key, cost in known.items()}, build)
     return [known[key] for name in commands if (key := f"{records} {name}") in known]
 
 
@@ -217,7 +219,7 @@ def table(costs: Sequence[CommandCost]) -> list[str]:
     return ["| records | command | CPU | most memory | by the clock |", "|---|---|---|---|---|", *rows]
 
 
-def main() -> int:
+def main() -> None:
     """Measure, and print all that is known."""
     parser = argparse.ArgumentParser(prog="python -m studies.scaling.large_dataset", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for datasets and results")
@@ -226,7 +228,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="also open the page of `browse` in a browser")
     arguments = parser.parse_args()
     out, records = arguments.out, arguments.records
-    try:
+    with wrong_input_ends("large_dataset"):
         if records < PAIRS:
             raise ValueError(f"--records: must be at least {PAIRS}, got {records}")
         report = progress_report()
@@ -234,11 +236,7 @@ def main() -> int:
         print("\n".join(table(measure(dataset, records, arguments.command, report))))
         if arguments.page:
             print(page_cost(out / f"{records}-made" / "page" / "index.html", out / f"{records}-page.png"))
-    except (ValueError, OSError) as error:
-        print(f"large_dataset: error: {error}", file=sys.stderr)
-        return 2
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Literal
 
 import torch
 from torch.utils.data import DataLoader
@@ -19,6 +20,7 @@ from droguekit.api.recipe_rendering import load_recipe
 from droguekit.torch import RenderStream, Sample
 from nav.detector.network.head import detection_loss
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
+from studies.wrong_input import wrong_input_ends
 
 # The seed paper's network input.
 HEIGHT_PX, WIDTH_PX = 320, 416
@@ -121,14 +123,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch-pairs", type=int, default=4, metavar="N", help="pairs in a batch (default 4)")
     parser.add_argument("--variant", choices=("s", "l"), default="s", help="of the network (default s)")
     options = parser.parse_args(arguments)
+    with wrong_input_ends("training_feed"):
+        _measure(options.out, options.pairs, options.replays, options.batch_pairs, options.variant)
+
+
+def _measure(out: Path, pairs: int, replays: int, batch_pairs: int, variant: Literal["s", "l"]) -> None:
+    if pairs < 1 or batch_pairs < 1 or replays < 0:
+        raise ValueError("--pairs, --batch-pairs: must be at least 1; --replays: must be at least 0")
     torch.manual_seed(0)
     # One core for the training, and the rest for the process that renders.
     torch.set_num_threads(1)
-    network = DetectorNetwork(NetworkConfig(options.variant)).train()
-    stream = RenderStream(feed_recipe(options.pairs), options.out, replays=options.replays, transform=left_and_right)
+    network = DetectorNetwork(NetworkConfig(variant)).train()
+    stream = RenderStream(feed_recipe(pairs), out, replays=replays, transform=left_and_right)
     for epoch, name in enumerate(("new and earlier pairs", "pairs of the cache alone")):
         stream.start_at(epoch)
-        print(measure_epoch(stream, options.batch_pairs, network).line(name), flush=True)
+        print(measure_epoch(stream, batch_pairs, network).line(name), flush=True)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from studies.world_variety.detection_by_kind import drogue_kind, score_by_kind
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety
+from studies.wrong_input import wrong_input_ends
 
 _ROWS_PER_SHEET = 6
 
@@ -43,23 +44,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder; a second run goes on")
         command.add_argument("--workers", type=int, metavar="N", help="processes that render (default: by the machine)")
     options = parser.parse_args(arguments)
-    if options.command == "measure":
-        _measure(options.recipes, options.scenes, options.out, options.workers)
-    elif options.command == "detect":
-        _detect(options.dataset, options.detector)
-    else:
-        try:
+    with wrong_input_ends("world_variety"):
+        if options.command == "measure":
+            _measure(options.recipes, options.scenes, options.out, options.workers)
+        elif options.command == "detect":
+            _detect(options.dataset, options.detector)
+        else:
             _draw_sheets(options.out, options.workers, options.names)
-        except ValueError as error:
-            parser.error(str(error))
 
 
-def _measure(recipes: Sequence[str], scenes: int, out: Path, workers: int | None) -> None:
+def _measure(names: Sequence[str], scenes: int, out: Path, workers: int | None) -> None:
+    # All are read before the first is rendered, which takes hours.
+    recipes = [load_recipe(name, frames={"count": scenes, "scenes": scenes}) for name in names]
     print(
         "recipe | pairs | drogues | distance mean | distance p10 | tankers | silhouettes | probes | probe sd x, y [px]"
     )
-    for name in recipes:
-        recipe = load_recipe(name, frames={"count": scenes, "scenes": scenes})
+    for recipe in recipes:
         dataset = render_dataset(recipe, out / recipe.name, workers=workers)
         print(f"{recipe.name} | {_cells(measure_variety(dataset))}", flush=True)
 

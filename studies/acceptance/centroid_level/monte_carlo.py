@@ -34,7 +34,7 @@ from studies.acceptance.centroid_level.drawn_frames import (
     ellipse_centers_px,
 )
 from studies.acceptance.centroid_level.solvers import MeasuredFrames, SolvedFrames, solve
-from studies.acceptance.finished_results import code_fingerprint
+from studies.acceptance.finished_results import results_fingerprint
 
 # Central differences: their error goes with the square of the step, that of rounding with its inverse; both stay near
 # 1e-8 of the derivative for steps of this size. [m and rad]
@@ -153,7 +153,7 @@ def run_cells(cells: Sequence[Cell], out: Path, report: ProgressReport) -> dict[
         ValueError: a cell that cannot be run, or `cells.json` is not ours.
         OSError: the folder cannot be written.
     """
-    path, code = out / CELLS_FILE, code_fingerprint()
+    path, code = out / CELLS_FILE, results_fingerprint()
     known = _read(path, code, report)
     wanted = list(dict.fromkeys(cells))
     todo = [cell for cell in wanted if repr(cell) not in known]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import typer
 
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from studies.engine_agreement.training_agreement import main
@@ -26,7 +25,7 @@ def test_both_engines_pictures_are_learned_from_and_stand_side_by_side(
 
 
 def test_too_few_frames_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(typer.Exit) as ended:
+    with pytest.raises(SystemExit) as ended:
         main(tmp_path, tmp_path / "test", recipe="smoke", pairs=10_000)
-    assert ended.value.exit_code == 2
-    assert capsys.readouterr().err.startswith("error: frames: ")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("training_agreement: error: frames: ")

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import typer
 
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from droguekit.scoring.detection.detection_truth import read_detection_truth
@@ -104,7 +103,7 @@ def test_trainings_are_used_again_only_for_their_own_options(
     assert trainings_of(kept=0.7) == ["mined-70-1"]
     assert trainings_of(further_passes=480) == ["even-further-1", "mined-30-further-1"]
     for changes in ({"image_passes": 2000}, {"further_passes": 960}):
-        with pytest.raises(typer.Exit):
+        with pytest.raises(SystemExit):
             trainings_of(**changes)
         assert "holds a training with other passes" in capsys.readouterr().err
     assert trainings_of(start_from="mobile-s") == ["even-from-mobile-s-1", "mined-30-mobile-s-from-mobile-s-1"]
@@ -114,6 +113,6 @@ def test_trainings_are_used_again_only_for_their_own_options(
 def test_two_ways_to_train_on_are_refused(
     trainings_of: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(typer.Exit):
+    with pytest.raises(SystemExit):
         trainings_of(start_from="mobile-s", further_passes=480)
     assert "--start-from, --further-passes: give one of them" in capsys.readouterr().err

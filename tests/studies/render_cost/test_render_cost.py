@@ -2,28 +2,47 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from studies.render_cost.__main__ import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
+from droguekit.batch.progress import PlainProgress, ProgressReport
+from studies.render_cost.__main__ import CYCLES, MITSUBA, OWN, CostOptions, stored_station, table_lines
 from studies.render_cost.noise_search import MeasuredView, frame_at, recipe_at
 
 
 def station() -> dict[str, Any]:
     row = {"noise": 0.05, "samples": 16, "cpu_s": 2.0, "is_least": False, "is_carried_on": False}
     others = {MITSUBA: row | {"cpu_s": 50.0, "is_carried_on": True}, CYCLES: row | {"cpu_s": 80.0, "is_least": True}}
-    return {"schema": 1, "distance_m": 10.0, "seed": 3, "full_samples": 4, "renderers": {OWN: row, **others}}
+    return {"distance_m": 10.0, "renderers": {OWN: row, **others}}
 
 
-def test_what_was_written_is_found_again_for_the_same_seed(tmp_path: Path) -> None:
-    write_station(tmp_path, station())
-    assert read_station(tmp_path, 10.0, 3, 4) == station()
-    assert read_station(tmp_path, 10.0, 4, 4) is None
-    assert read_station(tmp_path, 10.0, 3, None) is None
-    assert read_station(tmp_path, 20.0, 3, 4) is None
+def test_figures_are_used_again_only_for_their_options_code_and_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, measured = io.StringIO(), list[CostOptions]()
+
+    def measure(distance_m: float, options: CostOptions, report: ProgressReport) -> dict[str, Any]:
+        measured.append(options)
+        return station()
+
+    monkeypatch.setattr("studies.render_cost.__main__.compare_at", measure)
+    report, options = PlainProgress(told), CostOptions(3, 2, 4)
+    for _ in range(2):
+        assert stored_station(tmp_path, 10.0, options, report) == station()
+    assert measured == [options] and told.getvalue() == ""
+    stored_station(tmp_path, 20.0, options, report)
+    for changes in ({"seed": 4}, {"repeat": 3}, {"full_samples": None}):
+        stored_station(tmp_path, 10.0, replace(options, **changes), report)  # type: ignore[arg-type]
+    assert len(measured) == 5
+    assert told.getvalue().count("10m.json: 1 of 1 results are of other options, code or machine") == 3
+    monkeypatch.setattr("studies.stored_figures.RENDER_VERSION", "0")
+    stored_station(tmp_path, 20.0, options, report)
+    assert len(measured) == 6
 
 
 def test_lower_bounds_and_extrapolations_are_marked() -> None:

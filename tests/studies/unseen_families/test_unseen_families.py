@@ -103,7 +103,7 @@ def test_the_command_trains_without_each_family_and_prints_its_rows(
 
     monkeypatch.setattr(unseen_families, "train_briefly", fail)
     assert run(words, command) == 2
-    assert capsys.readouterr().err == "error: everything.log: the training failed\n"
+    assert capsys.readouterr().err == "unseen_families: error: everything.log: the training failed\n"
 
 
 def test_rows_are_those_of_the_family() -> None:
