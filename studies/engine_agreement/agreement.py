@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
+from droguekit.scoring.confidence_intervals import root_mean_square
 from render.engine import RenderEngine
+from scenes.sky.photometry import luminance
 from studies.engine_agreement.costs import CostComparison
-from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, compare_renderings, luminance
+from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, compare_renderings
 from studies.engine_agreement.navigation_agreement import (
     PairedErrors,
     mean_differences,
@@ -168,7 +170,7 @@ def part_ratios(frames: Sequence[FrameAgreement]) -> dict[str, float]:
 
 def _rms(values: NDArray[np.float64]) -> float:
     """Root mean square; infinite without values, because nothing was measured."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("inf")
+    return root_mean_square(values) if values.size else float("inf")
 
 
 # A difference of a fortieth of the image's white reaches from middle grey to black or white.
@@ -299,4 +301,4 @@ def _span(indices: NDArray[np.intp], size: int) -> slice:
 
 
 def _rms_or_zero(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
+    return root_mean_square(values) if values.size else 0.0

@@ -12,7 +12,8 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES
 from render.engine import RenderEngine, StereoRadiance
-from studies.engine_agreement.measures import eye_radiance, luminance
+from scenes.sky.photometry import luminance
+from studies.engine_agreement.measures import eye_radiance
 from studies.engine_agreement.paired_frames import frame_at, recipe_of_family
 
 COST_STATIONS_M = (40.0, 20.0, 10.0, 5.0, 2.0)

@@ -20,7 +20,7 @@ from geometry.stereo import EYES, Eye
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.photometry import REC709_LUMINANCE
+from scenes.sky.photometry import luminance
 from studies.engine_agreement.paired_frames import LAMP_CD_M2, RenderedFrame
 
 _FEWEST_PIXELS = 20
@@ -83,12 +83,6 @@ def compare_renderings(frame: FrameSpec, one: RenderedFrame, other: RenderedFram
 def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
     """Radiance of one eye."""
     return radiance.left if eye == "left" else radiance.right
-
-
-def luminance(radiance_cd_m2: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """(...) luminance of (..., 3) radiance. [cd/m2]"""
-    result: NDArray[np.float64] = np.einsum("...c,c->...", radiance_cd_m2.astype(np.float64), REC709_LUMINANCE)
-    return result
 
 
 def _centroids(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame, eye: Eye) -> NDArray[np.float64]:

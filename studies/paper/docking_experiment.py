@@ -21,11 +21,11 @@ from datasets_manifest.storage.pair_faults import PairFaults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
-from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
+from datasets_manifest.types.records import PairRecord, PixelBox
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from droguekit.scoring.confidence_intervals import Interval, mean_interval
 from droguekit.scoring.pose_benchmark import score_methods
-from droguekit.scoring.poses.drogue_truth import VISIBLE_FRACTION, drogue_truth
+from droguekit.scoring.poses.drogue_truth import drogue_truth
 from droguekit.scoring.poses.pose_errors import pose_error
 from droguekit.scoring.report.label_drawing import Picture, display_picture, jpeg_uri
 from droguekit.scoring.report.number_text import plain_number, three_digits
@@ -33,9 +33,9 @@ from droguekit.scoring.results.benchmark_result import BenchmarkResult, DatasetF
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
+from studies.acceptance.rendered.sequence_pairs import shows_enough
 from studies.paper.paper_inputs import ExperimentData, read_estimates_file
 
-LEAST_MARKERS = 4
 WORST_COUNT = 10
 
 # What is shown around the drogue, as a share of its box, and the picture's largest side.
@@ -179,24 +179,15 @@ def subset_scores(errors: Mapping[int, Array], frames: Sequence[int]) -> SubsetS
 
 
 def frames_in_view(records: Mapping[int, PairRecord]) -> list[int]:
-    """Pairs of which both eyes see at least four markers and the hub: wholly on the image, at most a tenth hidden."""
-    return [
-        index
-        for index, record in records.items()
-        if all(_is_enough(view) for view in (record.views.left, record.views.right))
-    ]
+    """Pairs of which both eyes see at least four markers and the hub, whether or not the sun stands beside it."""
+    truths = {index: drogue_truth(record) for index, record in records.items()}
+    return [index for index, truth in truths.items() if truth is not None and shows_enough(truth)]
 
 
 def _pose(record: PairRecord) -> RigidTransform:
     if record.left_from_drogue is None:
         raise ValueError(f"frame {record.frame_index}: shows no drogue")
     return record.left_from_drogue
-
-
-def _is_enough(view: ViewRecord) -> bool:
-    seen = sum(marker.in_image and marker.visible_fraction >= VISIBLE_FRACTION for marker in view.markers)
-    hub = view.hub
-    return seen >= LEAST_MARKERS and hub is not None and hub.in_image and hub.visible_fraction >= VISIBLE_FRACTION
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from droguekit.scoring.report.number_text import ABSENT, interval_text, millimet
 from droguekit.scoring.results.benchmark_result import MethodResult, PoseRow
 from droguekit.scoring.results.detection_result import DetectionResult, DetectorResult
 from geometry.se3 import Array
-from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, frames_in_view, subset_scores
+from studies.acceptance.rendered.sequence_pairs import LEAST_MARKERS
+from studies.paper.docking_experiment import DockingData, frames_in_view, subset_scores
 from studies.paper.paper_figures import published_row
 from studies.paper.published_results import (
     ANGLE_LIMIT_DEG,

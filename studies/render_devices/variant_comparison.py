@@ -18,6 +18,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from droguekit.batch.frame_cost import frames_per_second, warm_up_frames
 from droguekit.batch.worker_pool import run_in_own_process
+from droguekit.scoring.confidence_intervals import root_mean_square
 from geometry.stereo import EYES
 from render.device import Device, query_gpu
 from render.engine import load_engine
@@ -130,10 +131,10 @@ def compare_pair(one: RenderedPixels, other: RenderedPixels) -> PairAgreement | 
     if not drogue.any():
         return None
     first, second = (pixels.luminance[drogue].astype(np.float64) for pixels in (one, other))
-    noise = math.hypot(one.noise * _rms(first), other.noise * _rms(second))
+    noise = math.hypot(one.noise * root_mean_square(first), other.noise * root_mean_square(second))
     shown = (one.part_id > 0) | (other.part_id > 0)
     return PairAgreement(
-        over_noise=_rms(second - first) / noise,
+        over_noise=root_mean_square(second - first) / noise,
         mean_difference=float(second.sum() / first.sum() - 1),
         other_parts=float(np.mean(one.part_id[shown] != other.part_id[shown])),
     )
@@ -141,7 +142,7 @@ def compare_pair(one: RenderedPixels, other: RenderedPixels) -> PairAgreement | 
 
 def agree(pairs: list[PairAgreement]) -> bool:
     """Whether two variants agree within noise on pairs, all together."""
-    over_noise = _rms(np.array([pair.over_noise for pair in pairs]))
+    over_noise = root_mean_square(np.array([pair.over_noise for pair in pairs]))
     mean_difference = abs(float(np.mean([pair.mean_difference for pair in pairs])))
     return over_noise <= MOST_OVER_NOISE and mean_difference <= MOST_MEAN_DIFFERENCE
 
@@ -173,7 +174,3 @@ def render_rate(recipe: Recipe, pairs: int, workers: int, variant: VariantName) 
         finally:
             ended.set()
     return RenderRate(rate, float(np.mean(watts)) if watts else None)
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -18,6 +18,7 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.batch.progress import ProgressReport
 from droguekit.numerical_threads import one_thread
+from droguekit.scoring.confidence_intervals import root_mean_square
 from droguekit.scoring.poses.cramer_rao import FacingRing, feature_points
 from geometry.se3 import Array, angles_from_axis, skew
 from geometry.stereo import StereoRig, paper_rig
@@ -291,10 +292,16 @@ def _result(cell: Cell) -> CellResult:
         n=cell.draws,
         fixes=int(solved.fixed.sum()),
         position_sums_m=tuple(float(part.sum()) for part in np.array_split(position, min(BLOCKS, cell.draws))),
-        z_rms_m=_rms(errors[:, 2]),
-        nrms=(_rms(ratios[:, 0]), _rms(ratios[:, 1]), _rms(ratios[:, 2]), _rms(ratios[:, 3]), _rms(ratios[:, 4])),
+        z_rms_m=root_mean_square(errors[:, 2]),
+        nrms=(
+            root_mean_square(ratios[:, 0]),
+            root_mean_square(ratios[:, 1]),
+            root_mean_square(ratios[:, 2]),
+            root_mean_square(ratios[:, 3]),
+            root_mean_square(ratios[:, 4]),
+        ),
         clear_n=int(clear.sum()),
-        clear_nrms=(_rms(ratios[clear, 3]), _rms(ratios[clear, 4])) if clear.any() else None,
+        clear_nrms=(root_mean_square(ratios[clear, 3]), root_mean_square(ratios[clear, 4])) if clear.any() else None,
         nees_n=len(squares),
         nees=float(squares.mean()) / 5 if len(squares) else None,
         flips=int(mirrored.sum()),
@@ -337,8 +344,10 @@ def _tilt_scales(layout: MarkerLayout, cell: Cell, poses: Poses) -> Array:
 
 
 def _alternative(others: Array, own: Array) -> DepthAlternative:
-    z_rms_m = _rms(others)
-    return DepthAlternative(z_rms_m=z_rms_m, correlation=float(np.mean(others * own)) / (z_rms_m * _rms(own)))
+    z_rms_m = root_mean_square(others)
+    return DepthAlternative(
+        z_rms_m=z_rms_m, correlation=float(np.mean(others * own)) / (z_rms_m * root_mean_square(own))
+    )
 
 
 def _squares(solved: SolvedFrames, errors: Array) -> Array:
@@ -354,10 +363,6 @@ def _prior(poses: Poses) -> Array:
     level = Poses(np.broadcast_to(np.eye(3), poses.rotations.shape), np.zeros_like(poses.translations_m))
     spread: Array = pose_errors(poses, level).std(axis=0)
     return spread
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _read(path: Path, code: str, report: ProgressReport) -> dict[str, CellResult]:

@@ -22,8 +22,8 @@ from studies.acceptance.rendered.scored_frames import BEST
 
 # Our best method, with the filter behind it.
 FILTERED = f"{BEST}+filter"
-# Of the bars: "at least four markers and the hub in view", in both images.
-_FEWEST_MARKERS = 4
+LEAST_MARKERS = 4
+"""Of the bars: "at least four markers and the hub in view", in both images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,21 +100,25 @@ def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
     }
 
 
+def shows_enough(truth: DrogueTruth) -> bool:
+    """Whether both images show at least four markers, and the hub if the drogue has one."""
+    markers = truth.visible[:, : truth.layout.count].sum(axis=1)
+    return bool((markers >= LEAST_MARKERS).all() and truth.visible[:, truth.layout.count :].all())
+
+
 def _true_pair(data: Dataset, index: int) -> TruePair | None:
     record = data.record(index)
     truth, flown, drogue = drogue_truth(record), true_state(record), record.frame.drogue
     if truth is None or drogue is None:
         return None
     visibility: Visibility = "seen" if flown is None else flown.visibility
-    markers = truth.visible[:, : truth.layout.count].sum(axis=1)
-    in_view = bool((markers >= _FEWEST_MARKERS).all() and truth.visible[:, truth.layout.count :].all())
     return TruePair(
         frame_index=index,
         sequence_id=index if record.sequence_id is None else record.sequence_id,
         family=record.conditions.family,
         truth=truth,
         rim_radius_m=drogue.rim_radius_m,
-        in_view=in_view and visibility != "dazzled",
+        in_view=shows_enough(truth) and visibility != "dazzled",
         visibility=visibility,
     )
 
