@@ -6,8 +6,6 @@ body of the example drogue that ships.
 
 from __future__ import annotations
 
-import hashlib
-import io
 import sys
 from pathlib import Path
 
@@ -18,105 +16,26 @@ from scipy.interpolate import CubicSpline
 
 from drogue_models.drogue_families.body_meshes import body_meshes
 from drogue_models.drogue_families.fittings import (
+    FACE_THICKNESS_M,
     MARKER_SECTIONS,
     POCKET_DEPTH_M,
     RIM_SECTIONS,
     hub_annulus,
     hub_groove_m,
+    hub_holder,
     marker_outline_m,
     marker_plate,
     rim,
 )
+from drogue_models.drogue_families.user_meshes import load_body_mesh
 from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
-from drogue_models.parameters import BodyMesh, DrogueParameters
+from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, pocketed_plate, revolve
-from drogue_models.untrusted_files import limited_memory, read_regular
 from geometry.se3 import Array
 
-# Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
-_SMALLEST_BODY_M, _LARGEST_BODY_M = 0.05, 10.0
-_ARCHIVES = {"bz2", "gz", "tar.bz2", "tar.gz", "zip", "3mf", "3dxml", "zae"}
 # Cosine of a hose's direction with the x axis beyond which its rings begin at the y axis.
 _STEEP = 0.9
-# float32 files round a front at z = 0, or a radius, by this much for bodies of a few metres.
-_TOLERANCE_M = 1e-6
-
-
-def load_body_mesh(body: BodyMesh, rim_radius_m: float) -> trimesh.Trimesh:
-    """A user's mesh of the drogue's body, in the drogue frame (z from the mouth to the hose, z >= 0). [m]
-
-    Args:
-        body: the file.
-        rim_radius_m: of the drogue, whose outermost radius it is. [m]
-
-    Raises:
-        ValueError: the file is missing, has another hash than when the drogue was loaded, cannot be read as a mesh, or
-            is not a closed body of plausible size behind the rim plane and no wider than the rim.
-    """
-    file = body.file
-    try:
-        data = read_regular(file)
-    except OSError as error:
-        raise ValueError(
-            f"body_mesh: {file} cannot be read: {error.strerror}; a drogue from a dataset looks for its mesh in the "
-            "working directory"
-        ) from error
-    sha256 = hashlib.sha256(data).hexdigest()
-    if sha256 != body.sha256:
-        raise ValueError(
-            f"body_mesh: {file} has changed since the drogue was loaded; restore the file with sha256 {body.sha256}, "
-            f"got {sha256}"
-        )
-    mesh = _parse_body_mesh(data, file.suffix.lower().removeprefix("."), str(file))
-    fault = _body_mesh_fault(mesh, rim_radius_m)
-    if fault:
-        raise ValueError(f"body_mesh: {file} {fault}")
-    return mesh
-
-
-def _parse_body_mesh(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
-    # An archive of a megabyte can hold gigabytes.
-    readable = sorted(set(trimesh.available_formats()) - _ARCHIVES)
-    if file_type not in readable:
-        raise ValueError(f"body_mesh: {name} is of a kind that cannot be read; use one of {', '.join(readable)}")
-    try:
-        with limited_memory(len(data)):
-            mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False)
-    except Exception as error:  # each of trimesh's readers fails in its own way
-        raise ValueError(f"body_mesh: {name} cannot be read as {file_type}: {' '.join(str(error).split())}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"body_mesh: {name} holds no triangles; export one mesh of triangles")
-    return mesh
-
-
-def _body_mesh_fault(mesh: trimesh.Trimesh, rim_radius_m: float) -> str | None:
-    """Why the mesh cannot be used, and what to do; None for a valid mesh."""
-    if not np.isfinite(mesh.vertices).all():
-        return "has vertices that are not finite; export it again"
-    # Formats with normals or texture repeat the vertices along their seams.
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    low, high = mesh.bounds
-    size_m = float((high - low).max())
-    if not _SMALLEST_BODY_M <= size_m <= _LARGEST_BODY_M:
-        return (
-            f"must be {_SMALLEST_BODY_M:g} to {_LARGEST_BODY_M:g} m in size, with coordinates in metres, got {size_m:g}"
-        )
-    if low[2] < -_TOLERANCE_M:
-        return f"must lie behind the rim plane (z >= 0, z from the mouth to the hose), got z down to {low[2]:g} m"
-    # Distances and places are drawn so that the rim is in view.
-    radius_m = float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max())
-    if radius_m > rim_radius_m + _TOLERANCE_M:
-        return (
-            f"must lie within rim_radius_m, {rim_radius_m:g} m, of the z axis, got {radius_m:g} m; make the mesh "
-            "narrower or the rim wider"
-        )
-    if not mesh.is_watertight:
-        return "must be closed (watertight); close its holes and export it again"
-    if not mesh.is_winding_consistent or mesh.volume <= 0:
-        return "must have its normals outwards everywhere; recalculate them and export it again"
-    return None
-
 
 HOSE_RINGS_PER_SEGMENT = 6
 HOSE_SECTIONS = 32
@@ -171,7 +90,6 @@ def _carried_frame(tangents: Array) -> tuple[Array, Array]:
 
 
 # Our choices, as dimensions of published drogues do not include them.
-FACE_THICKNESS_M = 0.005
 RIB_WIDTH_M = 0.008
 RIB_THICKNESS_M = 0.004
 CANOPY_THICKNESS_M = 0.003
@@ -184,7 +102,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     """All parts of a drogue, closed, with outward normals.
 
     No part reaches before z = 0, so that none casts a shadow's edge onto the markers. Markers fill pockets of the face,
-    and the hub a groove of the coupling, with shared vertices.
+    and the hub a groove of the coupling, or of a holder in a user's body, with shared vertices.
 
     Args:
         drogue: its dimensions.
@@ -200,7 +118,8 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
         return body_meshes(drogue)
     meshes = {int(Part.FACE): _face(drogue), int(Part.RIM): rim(drogue)}
     if drogue.body_mesh is not None:
-        meshes[int(Part.COUPLING)] = load_body_mesh(drogue.body_mesh, drogue.rim_radius_m)
+        holders = [] if drogue.hub is None else [hub_holder(drogue, drogue.hub)]
+        meshes[int(Part.COUPLING)] = trimesh.util.concatenate([load_body_mesh(drogue), *holders])
     else:
         meshes[int(Part.CANOPY)] = _canopy(drogue)
         meshes[int(Part.COUPLING)] = _coupling(drogue)

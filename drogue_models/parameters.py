@@ -54,17 +54,31 @@ class BodyMesh(FrozenModel):
         path: as the user wrote it, relative to `folder` unless absolute.
         sha256: of the file.
         folder: that of the drogue's TOML file. It is not stored with a dataset, whose contents must not depend on the
-            place where it was made; a drogue that is read back looks in the working directory.
+            place where it was made; a drogue that is read back takes the dataset's copy, else looks in the working
+            directory.
     """
 
     path: str = Field(min_length=1, max_length=1000)
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     folder: Path = Field(default=Path(), exclude=True)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether name and contents are the same, in whatever folder."""
+        return isinstance(other, BodyMesh) and (self.path, self.sha256) == (other.path, other.sha256)
+
+    def __hash__(self) -> int:
+        """Of name and contents."""
+        return hash((self.path, self.sha256))
+
     @property
     def file(self) -> Path:
         """Path of the mesh."""
         return self.folder / self.path
+
+    @property
+    def file_type(self) -> str:
+        """Ending of its name in lower case, such as `ply`."""
+        return self.file.suffix.lower().removeprefix(".")
 
 
 class SatinPaint(FrozenModel):

@@ -16,6 +16,7 @@ SHARDS_FOLDER = "shards"
 SHARDS_FILE = "shards/layout.json"
 ANNOTATIONS_FOLDER = "annotations"
 CALIBRATION_FOLDER = "calibration"
+MESHES_FOLDER = "meshes"
 
 _MOST_DIGITS = 12
 

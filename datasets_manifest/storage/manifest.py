@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE
+from datasets_manifest.storage.mesh_copies import offer_mesh_copies
 from datasets_manifest.storage.storage import Location, map_in_order, open_storage
 from datasets_manifest.storage.writer import canonical_json
 from drogue_models.frozen_model import FrozenModel
@@ -258,7 +259,7 @@ def write_manifest(dataset: Location, manifest: Manifest) -> None:
 
 
 def read_manifest(dataset: Location) -> Manifest:
-    """The manifest of a dataset.
+    """The manifest of a dataset, whose drogues find its copies of their meshes from then on.
 
     Raises:
         ValueError: missing, truncated or edited; one line that names the file.
@@ -283,9 +284,11 @@ def read_manifest(dataset: Location) -> Manifest:
     except ValueError as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     try:
-        return Manifest.model_validate(table)
+        manifest = Manifest.model_validate(table)
     except ValidationError as error:
         raise ValueError(f"{path}: {explain(error)}") from error
+    offer_mesh_copies(storage, manifest.recipe)
+    return manifest
 
 
 def count_pairs(entries: Sequence[FrameEntry]) -> Counts:

@@ -142,10 +142,11 @@ RIM_SECTIONS = 256
 RIM_TUBE_SECTIONS = 16
 
 # Our choices, as dimensions of published drogues do not include them.
+FACE_THICKNESS_M = 0.005
 POCKET_DEPTH_M = 0.004
 MARKER_THICKNESS_M = 0.003
 HUB_THICKNESS_M = 0.002
-GROOVE_PER_HUB_THICKNESS = 1.5
+GROOVE_PER_HUB_THICKNESS, HOLDER_PER_HUB_THICKNESS = 1.5, 2.0
 # A dark sleeve lines the hub's hole: its bright wall would be visible past the near edge and shift that edge.
 SLEEVE_THICKNESS_M = 0.00002
 _BRACKET_M = (0.012, 0.003)
@@ -185,6 +186,15 @@ def hub_groove_m(drogue: DrogueParameters, hub: HubParameters) -> list[tuple[flo
     thickness_m = GROOVE_PER_HUB_THICKNESS * hub_thickness_m(drogue)
     sleeve_m = inner_m - SLEEVE_THICKNESS_M
     return [(sleeve_m, 0.0), (inner_m, 0.0), (inner_m, thickness_m), (outer_m, thickness_m), (outer_m, 0.0)]
+
+
+def hub_holder(drogue: DrogueParameters, hub: HubParameters) -> trimesh.Trimesh:
+    """A dark dish around the hub's annulus, whose bright walls would be seen beyond its edges."""
+    groove = hub_groove_m(drogue, hub)
+    edge_m = groove[-1][0] + min(HOLDER_BORDER_M, drogue.coupling_radius_m - hub.outer_radius_m)
+    back_m = HOLDER_PER_HUB_THICKNESS * hub_thickness_m(drogue)
+    profile = [*groove, (edge_m, 0.0), (edge_m, back_m), (groove[0][0], back_m)]
+    return revolve(np.array(profile) + np.array([0.0, hub.depth_m]), MARKER_SECTIONS)
 
 
 def marker_outline_m(drogue: DrogueParameters, index: int) -> Array:

@@ -16,6 +16,7 @@ from datasets_manifest.release.card import write_card, write_croissant
 from datasets_manifest.storage.frame_store import list_frames
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECIPE_FILE
 from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, read_manifest, with_build, write_manifest
+from datasets_manifest.storage.mesh_copies import write_mesh_copies
 from datasets_manifest.storage.packing import read_packing
 from datasets_manifest.storage.storage import Location, join, open_storage
 from datasets_manifest.storage.writer import write_calibration
@@ -338,7 +339,7 @@ def render_dataset(
 
 
 def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_by: Manifest | None = None) -> Manifest:
-    """Write everything besides the frames: manifest, annotations, calibration, card, Croissant.
+    """Write everything besides the frames: manifest, meshes, annotations, calibration, card, Croissant.
 
     Args:
         recipe: of the dataset.
@@ -347,9 +348,11 @@ def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_
         made_by: manifest with the versions and processor features that made the frames; None means this process.
 
     Raises:
+        ValueError: a user's mesh that is missing or was changed.
         OSError: they cannot be written.
     """
     finish_frames(out)
+    write_mesh_copies(out, recipe)
     manifest = build_manifest(out, recipe, RENDER_VERSION, split_of_scenes(recipe), tuple(drops))
     if made_by is not None:
         manifest = with_build(manifest, made_by.software, made_by.cpu_features)

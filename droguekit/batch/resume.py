@@ -51,6 +51,7 @@ _OWN_NAMES = {
     layout.SHARDS_FOLDER,
     layout.ANNOTATIONS_FOLDER,
     layout.CALIBRATION_FOLDER,
+    layout.MESHES_FOLDER,
 }
 _FRAME_FOLDERS = {layout.FRAMES_FOLDER, layout.SHARDS_FOLDER}
 # Machines differ in the last digits of what they draw; two draws differ by far more.

@@ -27,6 +27,7 @@ _OF_DATASETS = {
     layout.SHARDS_FOLDER,
     layout.ANNOTATIONS_FOLDER,
     layout.CALIBRATION_FOLDER,
+    layout.MESHES_FOLDER,
 }
 
 

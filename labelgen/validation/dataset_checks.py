@@ -33,6 +33,7 @@ from datasets_manifest.storage.layout import (
     shard_index_file,
 )
 from datasets_manifest.storage.manifest import FrameEntry, Manifest, count_pairs
+from datasets_manifest.storage.mesh_copies import mesh_copy_faults
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, Storage, open_storage
 from datasets_manifest.storage.writer import leftovers
@@ -156,6 +157,8 @@ def validate_dataset(path: Location) -> ValidationReport:
     tally.add("drops", _drop_faults(manifest))
     tally.add("split", _split_faults(manifest))
     tally.add("calibration", calibration_faults(path, manifest.recipe.rig))
+    if any(drogue.body_mesh is not None for drogue in manifest.recipe.drogues):
+        tally.add("meshes", mesh_copy_faults(path, manifest.recipe))
     tally.add("leftovers", [f"{entry}: was left by a run that was killed" for entry in leftovers(path)])
     for name, found in shard_faults(storage):
         tally.add(name, found)

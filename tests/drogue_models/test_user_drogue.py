@@ -24,7 +24,7 @@ def write_toml(folder: Path, text: str) -> str:
 
 def tube(length_m: float = 0.3) -> trimesh.Trimesh:
     mesh = trimesh.creation.cylinder(radius=0.1, height=length_m, sections=24)
-    mesh.apply_translation([0.0, 0.0, 0.25 + length_m / 2])
+    mesh.apply_translation([0.0, 0.0, 0.26 + length_m / 2])
     return mesh
 
 
@@ -113,8 +113,10 @@ def test_body_mesh_replaces_canopy_ribs_and_coupling(tmp_path: Path, suffix: str
     drogue = load_drogue(write_toml(tmp_path, RING + f'body_mesh = "body.{suffix}"\n'))
     meshes = drogue_meshes(drogue)
     assert int(Part.CANOPY) not in meshes and int(Part.RIBS) not in meshes
-    # The files hold float32 or eight decimals.
-    np.testing.assert_allclose(meshes[int(Part.COUPLING)].bounds, tube().bounds, rtol=0, atol=1e-7)
+    bounds = meshes[int(Part.COUPLING)].bounds
+    # The files hold float32 or eight decimals. The hub's holder begins before the tube.
+    np.testing.assert_allclose(bounds[:, :2], tube().bounds[:, :2], rtol=0, atol=1e-7)
+    assert bounds[:, 2] == pytest.approx([drogue.hub_depth_m, 0.56], abs=1e-7)
     assert {int(Part.FACE), int(Part.RIM), int(Part.HUB)} <= set(meshes)
 
 
@@ -124,8 +126,8 @@ def test_stored_drogue_pins_the_mesh_but_not_the_folder(tmp_path: Path, monkeypa
     stored = drogue.model_dump_json()
     assert str(tmp_path) not in stored
     again = DrogueParameters.model_validate_json(stored)
-    assert again.model_dump() == drogue.model_dump()
-    with pytest.raises(ValueError, match=r"body_mesh: body\.ply cannot be read: .*working directory"):
+    assert again == drogue and again.model_dump() == drogue.model_dump()
+    with pytest.raises(ValueError, match=r"body_mesh: body\.ply cannot be read: .*meshes, .*working directory"):
         drogue_meshes(again)
     monkeypatch.chdir(tmp_path)
     assert int(Part.COUPLING) in drogue_meshes(again)
@@ -155,7 +157,7 @@ def _not_finite(mesh: trimesh.Trimesh) -> None:
         (lambda mesh: mesh.invert(), "must have its normals outwards"),
         (lambda mesh: mesh.apply_scale(1000.0), "coordinates in metres, got 300"),
         (lambda mesh: mesh.apply_scale(0.001), "coordinates in metres, got 0.0003"),
-        (lambda mesh: mesh.apply_translation([0.0, 0.0, -0.3]), "behind the rim plane .* got z down to -0.05 m"),
+        (lambda mesh: mesh.apply_translation([0.0, 0.0, -0.3]), "behind the rim plane .* got z down to -0.04 m"),
         (lambda mesh: mesh.apply_translation([0.24, 0.0, 0.0]), "within rim_radius_m, 0.33 m, .* got 0.34 m; make"),
     ],
 )
@@ -167,6 +169,70 @@ def test_unfit_meshes_are_refused(tmp_path: Path, spoil: Callable[[trimesh.Trime
     with pytest.raises(ValueError, match=f"body_mesh: .*body.ply .*{message}") as caught:
         drogue_meshes(drogue)
     assert "\n" not in str(caught.value)
+
+
+def ball(radius_m: float, x_m: float, z_m: float) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(radius=radius_m, subdivisions=2)
+    mesh.apply_translation([x_m, 0.0, z_m])
+    return mesh
+
+
+def inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.invert()
+    return mesh
+
+
+def disc(radius_m: float, z_m: float) -> trimesh.Trimesh:
+    mesh = trimesh.creation.cylinder(radius=radius_m, height=0.002, sections=24)
+    mesh.apply_translation([0.0, 0.0, z_m])
+    return mesh
+
+
+def meshes_with(folder: Path, *pieces: trimesh.Trimesh) -> dict[int, trimesh.Trimesh]:
+    trimesh.util.concatenate([tube(), *pieces]).export(folder / "body.ply")
+    return drogue_meshes(load_drogue(write_toml(folder, RING + 'body_mesh = "body.ply"\n')))
+
+
+@pytest.mark.parametrize(
+    ("piece", "message"),
+    [
+        # Its volume is less than the tube's, so that the whole has a positive one.
+        (inside_out(ball(0.05, 0.2, 0.1)), r"the piece of 320 triangles around \(0\.2, .*, 0\.1\) m is inside out"),
+        # Half of it sticks out of the tube.
+        (inside_out(ball(0.05, 0.1, 0.4)), "is inside out"),
+        # Neither a corner nor an edge of its triangles is over the face or the hub: only their inside is.
+        (disc(0.329, 0.002), r"must lie behind the face, .* z = 0\.005 m, between 0\.21 and 0\.324 m"),
+        (disc(0.2, 0.1), r"must lie behind the hub's face, z = 0\.25 m, within 0\.075 m"),
+        # As far forward as the hub's face is too far: the two would flicker.
+        (disc(0.05, 0.251), "must lie behind the hub's face"),
+        (ball(0.01, 0.27, 0.012), "must lie behind the face"),
+    ],
+)
+def test_pieces_that_are_drawn_wrong_or_cover_the_features_are_refused(
+    tmp_path: Path, piece: trimesh.Trimesh, message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"body_mesh: .*body.ply .*{message}"):
+        meshes_with(tmp_path, piece)
+
+
+def test_pieces_beside_the_features_and_cavities_are_taken(tmp_path: Path) -> None:
+    cavity = inside_out(ball(0.05, 0.0, 0.4))
+    within_the_mouth, behind_the_face = ball(0.01, 0.15, 0.02), ball(0.01, 0.27, 0.016)
+    body = meshes_with(tmp_path, cavity, within_the_mouth, behind_the_face)[int(Part.COUPLING)]
+    assert body.is_watertight and body.body_count == 5
+
+
+def test_a_hub_in_a_mesh_shows_nothing_but_its_front(tmp_path: Path) -> None:
+    meshes = meshes_with(tmp_path)
+    hub, body = meshes[int(Part.HUB)], meshes[int(Part.COUPLING)]
+    walls = hub.vertices[hub.vertices[:, 2] > hub.bounds[0, 2]]
+    # The holder around it is as deep, and a wall of it lies on each of the annulus.
+    holder = max(body.split(), key=lambda piece: -piece.bounds[0, 2])
+    assert holder.bounds[0, 2] == hub.bounds[0, 2] and holder.bounds[1, 2] > walls[:, 2].max()
+    radii = np.hypot(*holder.vertices[:, :2].T)
+    for radius in np.unique(np.hypot(*hub.vertices[:, :2].T).round(9)):
+        assert np.abs(radii - radius).min() < 1e-9
+    assert radii.min() < np.hypot(*hub.vertices[:, :2].T).min() and radii.max() == pytest.approx(0.081, abs=1e-4)
 
 
 def test_a_mesh_may_be_as_wide_as_the_rim(tmp_path: Path) -> None:

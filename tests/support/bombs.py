@@ -29,7 +29,7 @@ from datasets_manifest.storage.image_codecs import decode_exr, decode_png
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import read_estimates
-from drogue_models.meshes import load_body_mesh
+from drogue_models.drogue_families.user_meshes import load_body_mesh
 from drogue_models.presets import load_drogue
 from droguekit.scoring.results.detection_result import read_detections
 from geometry.pinhole import PinholeCamera
@@ -170,9 +170,7 @@ def _read_map(path: Path) -> object:
 def _read_mesh(path: Path) -> object:
     drogue = path.with_name("drogue.toml")
     drogue.write_text(f'name = "own"\nmarker_count = 8\nmarker_ring_radius_m = 0.27\nbody_mesh = "{path.name}"\n')
-    loaded = load_drogue(str(drogue))
-    assert loaded.body_mesh is not None
-    return load_body_mesh(loaded.body_mesh, loaded.rim_radius_m)
+    return load_body_mesh(load_drogue(str(drogue)))
 
 
 def _gltf(count: int) -> bytes:
