@@ -16,12 +16,14 @@ def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> lis
     """Keypoint results in the symmetric order that fits the truth best, to be scored by `COCOeval`.
 
     An evenly spaced ring of eight looks the same after each of eight turns, so a detector may begin with any marker.
-    The order with the smallest sum of squared distances is taken; orders that are not a turn of the drogue, such as the
-    mirrored one, remain errors. Drogues beside the sought one have no keypoints and are passed over.
+    Results may be in the drogue's own order or clockwise from the top of the image, as `keypoint_order_in_image`; of
+    both and their turns, the one with the smallest sum of squared distances is taken. Orders that are no turn of
+    either, such as the mirrored one of a shipped ring, remain errors. Drogues beside the sought one have no keypoints
+    and are passed over.
 
     Args:
         truth: a file of `write_coco` or a dataset's `annotations`.
-        results: as for `COCO.loadRes`, with `keypoints` in any of the symmetric orders, such as that in the image.
+        results: as for `COCO.loadRes`, with `keypoints` in the drogue's order or that in the image, after any turn.
 
     Returns:
         Copies of the results; those on images without the sought drogue are unchanged.
@@ -30,7 +32,7 @@ def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> lis
         ValueError: a result with another number of keypoints than the truth has.
     """
     return [
-        _best_roll(
+        _best_order(
             result,
             [entry for entry in truth.imgToAnns[result["image_id"]] if "equal_keypoint_orders" in entry[NAMESPACE]],
         )
@@ -38,19 +40,21 @@ def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> lis
     ]
 
 
-def _best_roll(result: dict[str, Any], drogues: list[dict[str, Any]]) -> dict[str, Any]:
+def _best_order(result: dict[str, Any], drogues: list[dict[str, Any]]) -> dict[str, Any]:
     points = np.array(result["keypoints"], dtype=np.float64).reshape(-1, 3)
     best, least = points, np.inf
     for drogue in drogues:
         want = np.array(drogue["keypoints"], dtype=np.float64).reshape(-1, 3)
         if want.shape != points.shape:
             raise ValueError(f"keypoints: must be {len(want)} in every result, got {len(points)}")
-        for order in drogue[NAMESPACE]["equal_keypoint_orders"]:
-            rolled = points.copy()
-            rolled[list(order)] = points[: len(order)]
-            error = _squared_distance_px2(rolled, want)
+        own = np.array(drogue[NAMESPACE]["equal_keypoint_orders"], dtype=np.int64)
+        in_image = own[:, drogue[NAMESPACE]["keypoint_order_in_image"]]
+        for order in (*own, *in_image):
+            ordered = points.copy()
+            ordered[order] = points[: len(order)]
+            error = _squared_distance_px2(ordered, want)
             if error < least:
-                best, least = rolled, error
+                best, least = ordered, error
     return {**result, "keypoints": best.ravel().tolist()}
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,13 +14,15 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.records import ViewRecord
+from drogue_models.parameters import even_ring
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from drogue_models.presets import PRESETS
+from drogue_models.presets import PRESETS, load_drogue
 from geometry.stereo import EYES
 from labelgen.export.annotations.coco import DROGUE, HUB, MARKER, coco_header, coco_image_id, write_coco
 from labelgen.export.annotations.keypoint_orders import align_keypoint_orders
 from labelgen.export.export_log import ExportLog
-from labelgen.export.keypoints import symmetric_orders
+from labelgen.export.keypoints import clockwise_order, symmetric_orders
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +97,46 @@ def test_keypoints_in_the_image_order_are_perfect_up_to_a_turn(truth: Any) -> No
     results = keypoint_results(truth, image_order)
     assert average_precision(truth, results, "keypoints") < 0.6
     assert average_precision(truth, align_keypoint_orders(truth, results), "keypoints") == pytest.approx(1, abs=1e-12)
+
+
+EIGHT = even_ring(8, 0.27)
+OWN_ORDERS = {
+    "clockwise": EIGHT,
+    "anticlockwise": EIGHT[::-1],
+    "across": tuple(EIGHT[index] for index in (0, 4, 1, 5, 2, 6, 3, 7)),
+    "free": ((0.27, 0.0), (-0.25, 0.05), (0.0, 0.27), (0.1, -0.24)),
+    "two-rings": load_drogue("basket-strut-markers").marker_positions_m,
+}
+
+
+@pytest.mark.parametrize("positions_m", OWN_ORDERS.values(), ids=OWN_ORDERS)
+def test_keypoints_in_the_image_order_are_perfect_whatever_the_drogue_s_own(positions_m: tuple, tmp_path: Path) -> None:
+    drogue = load_drogue("basket-strut-markers" if len(positions_m) == 12 else "red-8")
+    drogue = drogue.model_copy(update={"marker_positions_m": positions_m})
+    annotations = []
+    for index, roll in enumerate(np.radians([0.0, 17.0, 100.0])):
+        turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
+        places_px = 300.0 * np.array(positions_m) @ turn.T + 200.0
+        view = SimpleNamespace(markers=[SimpleNamespace(center_proj_px=place) for place in places_px])
+        extra = {
+            "keypoint_order_in_image": clockwise_order(cast(ViewRecord, view)),
+            "equal_keypoint_orders": symmetric_orders(drogue),
+        }
+        points = np.column_stack([places_px, np.full(len(places_px), 2.0)]).ravel().tolist()
+        number = {"id": index + 1, "image_id": index + 1, "category_id": DROGUE, "num_keypoints": len(places_px)}
+        box = {"bbox": [50, 50, 300, 300], "area": 9e4, "iscrowd": 0}
+        annotations.append({**number, **box, "keypoints": points, "droguekit": extra})
+    sigmas = {"kpt_oks_sigmas": [0.02] * len(positions_m)}
+    images = [{"id": index + 1, "width": 400, "height": 400} for index in range(3)]
+    table = {"info": {"droguekit": sigmas}, "images": images, "categories": [{"id": DROGUE}]}
+    file = tmp_path / "all.json"
+    file.write_text(json.dumps({**table, "annotations": annotations}))
+    for order_of in (image_order, lambda extra: extra["equal_keypoint_orders"][-1]):
+        truth = COCO(str(file))
+        results = align_keypoint_orders(truth, keypoint_results(truth, order_of))
+        assert average_precision(truth, results, "keypoints") == pytest.approx(1, abs=1e-12)
+    swapped = keypoint_results(truth, lambda extra: np.reshape(image_order(extra), (-1, 2))[:, ::-1].ravel())
+    assert average_precision(truth, align_keypoint_orders(truth, swapped), "keypoints") < 0.2
 
 
 def test_a_mirrored_order_is_no_turn(truth: Any) -> None:
