@@ -11,8 +11,11 @@ from drogue_models.bodies import BasketBody
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, read_only
 
-# Tolerance of an even ring of markers, far below the accuracy of any centroid.
-_RING_TOLERANCE_M = 1e-6
+# Markers in one plane have equal depths but for rounding errors.
+_FLAT_TOLERANCE_M = 1e-6
+# Positions over a marker's radius: what pictures can hardly tell, and more than rounding to millimetres changes markers
+# of 5 cm radius.
+_SYMMETRY_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +75,31 @@ class MarkerLayout:
     @cached_property
     def is_flat(self) -> bool:
         """Whether all markers have the same depth."""
-        return self.count == 0 or bool(np.ptp(self.centers_m[:, 2]) < _RING_TOLERANCE_M)
+        return self.count == 0 or bool(np.ptp(self.centers_m[:, 2]) < _FLAT_TOLERANCE_M)
 
     @cached_property
     def ring_radius_m(self) -> float | None:
-        """Radius of the circle in the rim plane around the origin on which all markers lie, or None. [m]"""
+        """Radius of the circle in the rim plane around the origin on which all markers lie, or None. [m]
+
+        Their distances from the origin may differ by 3 % of a marker's radius; this is the mean.
+        """
         radii = np.hypot(self.centers_m[:, 0], self.centers_m[:, 1])
-        if self.count == 0 or np.abs(self.centers_m[:, 2]).max() > _RING_TOLERANCE_M:
+        if self.count == 0 or np.abs(self.centers_m[:, 2]).max() > _FLAT_TOLERANCE_M:
             return None
-        return float(radii.mean()) if np.ptp(radii) < _RING_TOLERANCE_M else None
+        return float(radii.mean()) if np.ptp(radii) < self.tolerance_m else None
+
+    @property
+    def tolerance_m(self) -> float:
+        """How far markers may be from where a symmetry puts them. [m]"""
+        return _SYMMETRY_TOLERANCE * self.radius_m
 
     @cached_property
     def symmetry_order(self) -> int:
-        """Number of rotations about the axis that map the markers onto themselves (8 for an even ring of 8)."""
+        """Number of rotations about the axis that map the markers onto themselves (8 for an even ring of 8).
+
+        They may miss by 3 % of a marker's radius, so that a ring of rounded positions counts as the even one it is
+        meant to be: pictures tell its turns apart by chance only.
+        """
         for order in range(self.count, 1, -1):
             angle = 2 * np.pi / order
             turn = np.array(
@@ -92,7 +107,7 @@ class MarkerLayout:
             )
             turned = self.centers_m @ turn.T
             gaps = np.linalg.norm(turned[:, None] - self.centers_m[None], axis=-1).min(axis=1)
-            if gaps.max() < _RING_TOLERANCE_M:
+            if gaps.max() < self.tolerance_m:
                 return order
         return 1
 

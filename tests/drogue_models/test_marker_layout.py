@@ -5,7 +5,7 @@ import pytest
 
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters, even_ring
-from drogue_models.presets import PRESETS, RING_RADIUS_M
+from drogue_models.presets import PRESETS, RING_RADIUS_M, load_drogue
 
 
 @pytest.mark.parametrize("count", [5, 7, 8])
@@ -40,6 +40,24 @@ def test_presets_leave_ten_millimetres_of_face_around_every_marker() -> None:
 )
 def test_symmetry_order(positions: tuple[tuple[float, float], ...], order: int) -> None:
     assert marker_layout(DrogueParameters(name="x", marker_positions_m=positions)).symmetry_order == order
+
+
+@pytest.mark.parametrize("count", [5, 7, 8])
+def test_a_ring_of_rounded_positions_is_the_ring_it_is_meant_to_be(count: int) -> None:
+    rounded = tuple((round(x, 3), round(y, 3)) for x, y in even_ring(count, RING_RADIUS_M))
+    layout = marker_layout(DrogueParameters(name="x", marker_positions_m=rounded))
+    assert layout.symmetry_order == count
+    # Rounding moves a marker by up to 0.71 mm.
+    assert layout.ring_radius_m == pytest.approx(RING_RADIUS_M, abs=0.7e-3)
+    # A marker that was meant to be elsewhere is.
+    moved = (rounded[0], rounded[1], (rounded[2][0] + 0.004, rounded[2][1]), *rounded[3:])
+    layout = marker_layout(DrogueParameters(name="x", marker_positions_m=moved))
+    assert layout.symmetry_order == 1 and layout.ring_radius_m is None
+
+
+@pytest.mark.parametrize(("name", "order"), [("basket-strut-markers", 6), ("cone-markers", 6)])
+def test_symmetry_of_shipped_bodies(name: str, order: int) -> None:
+    assert marker_layout(load_drogue(name)).symmetry_order == order
 
 
 def test_symmetry_maps_the_markers_onto_themselves() -> None:
