@@ -94,6 +94,27 @@ def symmetric_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
     return tuple(orders)
 
 
+@lru_cache(maxsize=64)
+def mirrored_order(drogue: DrogueParameters) -> tuple[int, ...] | None:
+    """For each marker the one that takes its place in a mirrored image; None where the markers have no mirror axis.
+
+    Of several axes it is the one through the first marker, or the next one.
+    """
+    layout = marker_layout(drogue)
+    places, depths_m = layout.centers_m[:, 0] + 1j * layout.centers_m[:, 1], layout.centers_m[:, 2]
+    off_axis = places[np.abs(places) > layout.tolerance_m]
+    if not len(off_axis):
+        return tuple(range(layout.count))
+    for other in off_axis:
+        # The mirror that takes the first marker towards this one.
+        product = off_axis[0] * other
+        mirrored = product / np.abs(product) * places.conj()
+        gaps = np.hypot(np.abs(mirrored[:, None] - places), depths_m[:, None] - depths_m)
+        if gaps.min(axis=1).max() < layout.tolerance_m:
+            return tuple(int(index) for index in gaps.argmin(axis=1))
+    return None
+
+
 def log_cut_labels(log: ExportLog, record: PairRecord, eye: Eye) -> None:
     """Log a drogue without visible pixels, or whose box is cut at the image's border."""
     view = view_of(record, eye)

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord
-from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.coco import (
     HUB,
@@ -32,6 +31,7 @@ from labelgen.export.keypoints import (
     keypoint_count,
     log_absent_keypoints,
     log_cut_labels,
+    mirrored_order,
     view_keypoints,
     view_of,
 )
@@ -110,11 +110,11 @@ def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bo
         shares = [(point.x / camera.width_px, point.y / camera.height_px, point.flag) for point in points]
         return [[0, *_shares(drogue["bbox"], record), *(number for share in shares for number in share)], *others]
 
-    if not _one_flip_fits(source.manifest, in_image_order):
+    drogues = sorted(source.manifest.recipe.drogues, key=lambda drogue: -drogue.marker_count)
+    flip, *others = (flip_indices(drogue, count, in_image_order) for drogue in drogues)
+    if flip is None or any(other != flip for other in others):
         log.lost("values of flip_idx that do not fit all drogues: train with fliplr=0")
-    ring = max(len(drogue.marker_positions_m) for drogue in source.manifest.recipe.drogues)
-    flip = [-index % ring if index < ring else index for index in range(count)]
-    return _write(source, out, log, rows, (f"kpt_shape: [{count}, 3]", f"flip_idx: {flip}"))
+    return _write(source, out, log, rows, (f"kpt_shape: [{count}, 3]", f"flip_idx: {flip or list(range(count))}"))
 
 
 def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[str, ...]) -> list[Path]:
@@ -160,11 +160,17 @@ def _split_lines(splits: set[str], log: ExportLog) -> list[str]:
     return lines
 
 
-def _one_flip_fits(manifest: Manifest, in_image_order: bool) -> bool:
-    """Whether one `flip_idx` is right for all drogues of a dataset."""
-    layouts = [marker_layout(drogue) for drogue in manifest.recipe.drogues]
-    even = all(layout.symmetry_order == layout.count for layout in layouts)
-    return len({layout.count for layout in layouts}) == 1 and (even or in_image_order)
+def flip_indices(drogue: DrogueParameters, count: int, in_image_order: bool) -> list[int] | None:
+    """The keypoint that takes the place of each one in a mirrored image; None where markers have no mirror axis.
+
+    Args:
+        drogue: whose keypoints.
+        count: of keypoints, absent ones among them.
+        in_image_order: whether they begin at the top and go clockwise, or have the drogue's own order.
+    """
+    markers = drogue.marker_count
+    order = tuple(-index % markers for index in range(markers)) if in_image_order else mirrored_order(drogue)
+    return None if order is None else [*order, *range(markers, count)]
 
 
 def _shares(box: list[float], record: PairRecord) -> list[float]:

@@ -10,11 +10,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
+from drogue_models.parameters import even_ring
 from drogue_models.parts import FIRST_MARKER_ID, Part
+from drogue_models.presets import PRESETS, load_drogue
 from geometry.stereo import EYES
+from labelgen.export.annotations.yolo import flip_indices
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
@@ -142,6 +146,43 @@ def test_boxes_of_all_classes_are_the_part_ids(exports: dict[str, Path], mixed_d
             assert row[0] == number
             middle = np.array(box[:2]) + 0.5 + np.array(box[2:]) / 2
             np.testing.assert_allclose(in_pixels(row[1:].reshape(2, 2)), [middle, box[2:]], atol=1e-9)
+
+
+EIGHT = even_ring(8, 0.27)
+
+
+@pytest.mark.parametrize(
+    "positions_m",
+    [
+        EIGHT,
+        EIGHT[::-1],
+        tuple(EIGHT[index] for index in (0, 4, 1, 5, 2, 6, 3, 7)),
+        even_ring(7, 0.27)[1:],
+        tuple((round(x, 3), round(y, 3)) for x, y in even_ring(7, 0.27)),
+        load_drogue("basket-strut-markers").marker_positions_m,
+    ],
+    ids=["clockwise", "anticlockwise", "across", "gap", "rounded", "two-rings"],
+)
+def test_a_mirrored_drogue_with_flipped_keypoints_is_a_drogue_after_a_turn(positions_m: tuple) -> None:
+    drogue = load_drogue("basket-strut-markers" if len(positions_m) == 12 else "red-8")
+    drogue = drogue.model_copy(update={"marker_positions_m": positions_m})
+    flip = flip_indices(drogue, 14, in_image_order=False)
+    assert flip is not None and flip[len(positions_m) :] == list(range(len(positions_m), 14))
+    places = np.array(positions_m)
+    mirrored = (places * [-1, 1])[flip[: len(places)]]
+    turn, misfit_m = Rotation.align_vectors(
+        np.column_stack([mirrored, np.zeros(len(places))]), np.column_stack([places, np.zeros(len(places))])
+    )
+    # Root of the sum of squares; rounding to millimetres moves each of seven by up to 0.7 mm.
+    assert misfit_m < 4e-3 and turn.as_matrix()[2, 2] == pytest.approx(1)
+
+
+def test_markers_without_a_mirror_axis_have_no_flip() -> None:
+    free = ((0.27, 0.0), (-0.25, 0.05), (0.0, 0.27), (0.1, -0.24))
+    drogue = PRESETS["red-8"].model_copy(update={"marker_positions_m": free})
+    assert flip_indices(drogue, 8, in_image_order=False) is None
+    assert flip_indices(drogue, 8, in_image_order=True) == [0, 3, 2, 1, 4, 5, 6, 7]
+    assert flip_indices(PRESETS["red-7"], 8, in_image_order=False) == [0, 6, 5, 4, 3, 2, 1, 7]
 
 
 def test_several_drogues_have_no_common_flip(mixed_dataset: Path, small_dataset: Path, tmp_path: Path) -> None:
