@@ -13,22 +13,27 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
-from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
+from datasets_manifest.types.appearance import DrogueCondition
+from datasets_manifest.types.records import PairRecord, PixelBox
+from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
+from labelgen.export.annotations.coco import read_part_ids
 from labelgen.export.export_log import ExportLog, require_pinholes
 from labelgen.export.frame_files import export_measured_image
 from labelgen.export.keypoints import log_cut_labels, view_of
-from labelgen.part_pixels import drogue_hull_m
+from labelgen.part_pixels import drogue_hull_m, parts_mask
+from labelgen.segmentation_masks import amodal_masks, union_of_masks
 
 _NUMBER_OF_EYE: dict[Eye, int] = {"left": 2, "right": 3}
-# KITTI defines its occlusion levels in words; our limits are these visible shares of the markers' area.
+# KITTI defines its occlusion levels in words; our limits are these visible shares of the drogue's area.
 _UNOCCLUDED_FRACTION, _PARTLY_FRACTION = 0.99, 0.5
 
 
@@ -69,7 +74,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
                 export_measured_image(
                     source, record.frame_index, eye, training / f"image_{number}" / f"{name}.png", log
                 )
-                label = kitti_label(record, eye)
+                label = kitti_label(record, eye, read_part_ids(source, record, eye))
                 _write_lines(training / f"label_{number}" / f"{name}.txt", [] if label is None else [label])
                 log_cut_labels(log, record, eye)
                 log.lost("labels without pitch and roll, which KITTI does not know", int(label is not None))
@@ -92,8 +97,14 @@ def kitti_calibration(rig: StereoRig) -> list[str]:
     return [f"{name}: {' '.join(repr(float(number)) for number in matrix.ravel())}" for name, matrix in lines.items()]
 
 
-def kitti_label(record: PairRecord, eye: Eye) -> str | None:
-    """The line of one eye's drogue, or None where no pixel shows it; its location is in the left eye's axes."""
+def kitti_label(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None) -> str | None:
+    """The line of one eye's drogue, or None where no pixel shows it; its location is in the left eye's axes.
+
+    Args:
+        record: the truth.
+        eye: which image.
+        part_id: (H, W) its part ids; without them the markers tell how much of the drogue is hidden.
+    """
     view, drogue, pose = view_of(record, eye), record.frame.drogue, record.left_from_drogue
     box, full = view.box_visible_xywh_px, view.box_full_xywh_px
     if box is None or full is None or drogue is None or pose is None or record.yaw_deg is None:
@@ -114,7 +125,9 @@ def kitti_label(record: PairRecord, eye: Eye) -> str | None:
         rotation_y,
     )
     truncated = _outside_fraction(full, record.frame.rig.camera)
-    return f"drogue {truncated!r} {_occlusion(view)} {' '.join(repr(float(number)) for number in numbers)}"
+    return (
+        f"drogue {truncated!r} {_occlusion(record, eye, part_id)} {' '.join(repr(float(number)) for number in numbers)}"
+    )
 
 
 def _outside_fraction(box: PixelBox, camera: PinholeCamera) -> float:
@@ -125,13 +138,31 @@ def _outside_fraction(box: PixelBox, camera: PinholeCamera) -> float:
     return 1.0 - max(on_u, 0.0) * max(on_v, 0.0) / (width * height) if width * height > 0 else 0.0
 
 
-def _occlusion(view: ViewRecord) -> int:
-    """KITTI's level by the markers on the image: 0 fully visible, 1 partly, 2 largely occluded, 3 unknown."""
-    seen = [marker.visible_fraction for marker in view.markers if marker.in_image]
-    if not seen:
+def _occlusion(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None) -> int:
+    """KITTI's level by what is on the image: 0 fully visible, 1 partly, 2 largely occluded, 3 unknown."""
+    visible = _marker_fraction(record, eye) if part_id is None else _visible_fraction(record, eye, part_id)
+    if visible is None:
         return 3
-    mean = sum(seen) / len(seen)
-    return 0 if mean >= _UNOCCLUDED_FRACTION else 1 if mean >= _PARTLY_FRACTION else 2
+    return 0 if visible >= _UNOCCLUDED_FRACTION else 1 if visible >= _PARTLY_FRACTION else 2
+
+
+def _visible_fraction(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> float:
+    """Share of the drogue's pixels on the image that nothing hides."""
+    assert record.frame.drogue is not None
+    parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
+    whole = union_of_masks(amodal_masks(record, eye, part_id), parts, part_id.shape)
+    return np.count_nonzero(parts_mask(part_id, parts)) / max(np.count_nonzero(whole), 1)
+
+
+def _marker_fraction(record: PairRecord, eye: Eye) -> float | None:
+    """Mean visible share of the markers that are on the drogue and on the image; None where there are none."""
+    condition = record.frame.condition or DrogueCondition()
+    seen = [
+        marker.visible_fraction
+        for index, marker in enumerate(view_of(record, eye).markers)
+        if marker.in_image and not condition.of_marker(index).missing
+    ]
+    return sum(seen) / len(seen) if seen else None
 
 
 def _wrapped(angle_rad: float) -> float:

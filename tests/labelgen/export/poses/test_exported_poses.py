@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
+from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import Part
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
 from labelgen.export.poses.kitti import kitti_label
-from labelgen.part_pixels import drogue_hull_m
+from labelgen.part_pixels import drogue_hull_m, drogue_mask
 from tests.support.drawn_pairs import Pair
 
 
@@ -100,7 +103,7 @@ def test_kitti_box_of_a_drogue_that_only_yaws_is_exact(full_pairs: list[Pair]) -
     draw = type(pair)
     record = draw(pair.frame.model_copy(update={"left_from_drogue": pose})).record
     for eye in EYES:
-        numbers = [0.0, *map(float, kitti_label(record, eye).split()[1:])]
+        numbers = [0.0, *map(float, kitti_label(record, eye, None).split()[1:])]
         hull = drogue_hull_m(record.frame.drogue)
         corners = np.array(list(itertools.product(*zip(hull.min(axis=0), hull.max(axis=0), strict=True))))
         want = pose.apply(corners)
@@ -109,6 +112,37 @@ def test_kitti_box_of_a_drogue_that_only_yaws_is_exact(full_pairs: list[Pair]) -
         # The angle at which the eye sees it: none where the drogue's hose points straight along the ray.
         middle = want.mean(axis=0) - record.frame.rig.eye_offset_m(eye)
         np.testing.assert_allclose(numbers[3], numbers[14] - np.arctan2(middle[0], middle[2]), atol=1e-12)
+
+
+def kitti_occlusion(record: PairRecord, part_id: np.ndarray | None) -> int:
+    return int(kitti_label(record, "left", part_id).split()[2])
+
+
+def test_kitti_counts_what_hides_the_drogue_by_its_pixels(full_pairs: list[Pair]) -> None:
+    pair = full_pairs[0]
+    part_id = pair.radiance.left.part_id
+    rows, columns = np.nonzero(drogue_mask(part_id, pair.record.frame.drogue.marker_count))
+    for hidden, level in ((0.0, 0), (0.005, 0), (0.02, 1), (0.45, 1), (0.55, 2)):
+        behind = part_id.copy()
+        count = int(hidden * len(rows))
+        behind[rows[:count], columns[:count]] = Part.OBSTACLE
+        assert kitti_occlusion(pair.record, behind) == level
+
+
+def test_kitti_counts_no_missing_marker_as_hidden(full_pairs: list[Pair]) -> None:
+    record = full_pairs[0].record
+    off, *others = record.views.left.markers
+    gone = {"markers": (off.model_copy(update={"visible_fraction": 0.0}), *others)}
+    left = record.views.left.model_copy(update=gone)
+    hidden = record.model_copy(update={"views": record.views.model_copy(update={"left": left})})
+    assert kitti_occlusion(hidden, None) == 1
+    conditions = (SurfaceCondition(missing=True), *(SurfaceCondition() for _ in others))
+    frame = record.frame.model_copy(update={"condition": DrogueCondition(markers=conditions)})
+    missing = hidden.model_copy(update={"frame": frame})
+    assert kitti_occlusion(missing, None) == kitti_occlusion(missing, full_pairs[0].radiance.left.part_id) == 0
+    bare = left.model_copy(update={"markers": ()})
+    views = record.views.model_copy(update={"left": bare})
+    assert kitti_occlusion(record.model_copy(update={"views": views}), None) == 3
 
 
 def test_kitti_boxes_and_calibration(mixed_dataset: Path, tmp_path: Path) -> None:
