@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from drogue_models.bodies import (
     BODY_FAMILIES,
@@ -23,6 +23,7 @@ from drogue_models.bodies import (
     RibbonBody,
     RimLamps,
 )
+from drogue_models.drogue_families.body_symmetry import body_symmetry_order
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.parts import FIRST_MARKER_ID, Part, marker_id
@@ -227,3 +228,33 @@ def test_new_fields_leave_the_json_of_other_drogues_as_it_was() -> None:
 def test_the_families_are_those_of_the_bodies() -> None:
     bodies, _ = get_args(DrogueBody)
     assert tuple(body.model_fields["family"].default for body in get_args(bodies)) == BODY_FAMILIES
+
+
+def maps_onto_itself(vertices_m: np.ndarray, order: int) -> bool:
+    angle = 2 * np.pi / order
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    gaps_m, _ = cKDTree(vertices_m).query(vertices_m @ turn.T)
+    return bool(gaps_m.max() < 1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILIES if load_drogue(name).marker_count == 0])
+def test_the_symmetry_of_a_body_is_that_of_its_mesh(name: str) -> None:
+    order = body_symmetry_order(load_drogue(name))
+    meshes = drogue_meshes(load_drogue(name))
+    pieces = [piece for mesh in meshes.values() for piece in mesh.split()]
+    # Round pieces are polygons, which fewer turns map onto themselves.
+    beside_axis = [piece.vertices for piece in pieces if np.hypot(*piece.vertices[:, :2].mean(axis=0)) > 1e-6]
+    if beside_axis:
+        vertices_m = np.concatenate(beside_axis)
+        assert maps_onto_itself(vertices_m, order)
+        assert not any(maps_onto_itself(vertices_m, order * prime) for prime in (2, 3, 5, 7))
+    elif order:
+        assert name == "cone-white" and maps_onto_itself(meshes[int(Part.CANOPY)].vertices, order)
+    else:
+        assert name == "cone-orange"
+
+
+def test_the_symmetry_of_a_flat_ring_is_that_of_its_ribs() -> None:
+    plain = PRESETS["red-8"].model_copy(update={"marker_positions_m": ()})
+    assert body_symmetry_order(plain) == 24
+    assert body_symmetry_order(plain.model_copy(update={"rib_count": 0})) == 0

@@ -14,6 +14,8 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.layout import MESHES_FOLDER, RECIPE_FILE
 from drogue_models.drogue_families import mesh_files
+from drogue_models.drogue_families.body_symmetry import body_symmetry_order
+from drogue_models.parts import Part
 from droguekit.batch.merge_shards import merge_shards
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import describe_dataset
@@ -44,7 +46,9 @@ def test_labels_of_the_shipped_example_agree_with_the_pixels(tmp_path: Path) -> 
         pair = Pair(sample_frame(recipe, index))
         record = pair.record
         assert check_against_passes(record, pair.radiance) + projection_faults(record) + box_faults(record) == []
-        assert np.count_nonzero(pair.radiance.left.part_id == 6) > 50
+        assert np.count_nonzero(pair.radiance.left.part_id == Part.HUB) > 50
+    # The funnel is turned about the axis in 48 steps.
+    assert body_symmetry_order(recipe.drogue) == 48
 
 
 @pytest.fixture

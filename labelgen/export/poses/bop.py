@@ -26,6 +26,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord
+from drogue_models.drogue_families.body_symmetry import body_symmetry_order
 from drogue_models.marker_layout import marker_layout
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
@@ -310,15 +311,21 @@ def write_models(recipe: Recipe, folder: Path) -> None:
 def model_info(drogue: DrogueParameters, vertices_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
     """Diameter, extent and symmetries of a model, from its (V, 3) vertices. [mm]
 
-    The symmetries are those of the markers: turns about the axis as 4x4 matrices, row by row, without the identity.
+    The symmetries are those of the markers, or of the body of a drogue without any: turns about the axis as 4x4
+    matrices, row by row, without the identity, or the axis about which every turn is one.
+
+    Raises:
+        ValueError: a user's body mesh that is missing or was changed.
     """
     low, size = vertices_mm.min(axis=0), np.ptp(vertices_mm, axis=0)
     hull = vertices_mm[ConvexHull(vertices_mm).vertices]
-    order = marker_layout(drogue).symmetry_order
+    order = marker_layout(drogue).symmetry_order if drogue.marker_count else body_symmetry_order(drogue)
     info: dict[str, Any] = {"diameter": float(pdist(hull).max())}
     info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
     info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
-    if order > 1:
+    if order == 0:
+        info["symmetries_continuous"] = [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]
+    elif order > 1:
         info["symmetries_discrete"] = [_turn(2 * np.pi * index / order) for index in range(1, order)]
     return info
 

@@ -16,10 +16,11 @@ from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
+from drogue_models.presets import load_drogue
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
-from labelgen.export.poses.bop import depth_numbers, write_bop
+from labelgen.export.poses.bop import depth_numbers, model_info, write_bop
 from tests.support.display_encoding import shown
 from tests.support.drawn_pairs import Pair
 from tests.support.recipe_builder import build_recipe, stations
@@ -117,6 +118,16 @@ def test_poses_score_nothing_on_truth_and_under_a_roll_by_a_marker(bop: Path, fu
             image = matrix @ (pose[:3, :3] @ first_mm + pose[:3, 3])
             view = getattr(pair.record.views, eye)
             np.testing.assert_allclose(image[:2] / image[2], view.markers[0].center_proj_px, atol=1e-9)
+
+
+def test_models_without_markers_have_the_symmetry_of_their_body() -> None:
+    points_mm = np.random.default_rng(1).uniform(-300, 300, (20, 3))
+    (half_turn,) = model_info(load_drogue("basket-grey"), points_mm)["symmetries_discrete"]
+    np.testing.assert_allclose(np.reshape(half_turn, (4, 4)), np.diag([-1, -1, 1, 1]), rtol=0, atol=1e-15)
+    round_cone = model_info(load_drogue("cone-orange"), points_mm)
+    assert round_cone["symmetries_continuous"] == [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]
+    assert "symmetries_discrete" not in round_cone
+    assert "symmetries_continuous" not in model_info(load_drogue("red-8"), points_mm)
 
 
 def test_models_are_measured_in_millimetres(bop: Path) -> None:
