@@ -6,6 +6,7 @@ body of the example drogue that ships.
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -155,6 +156,9 @@ def _rib_line_m(drogue: DrogueParameters) -> tuple[Array, Array]:
 def _ribs(drogue: DrogueParameters) -> trimesh.Trimesh:
     front, back = _rib_line_m(drogue)
     thickness_m = min(RIB_THICKNESS_M, drogue.rim_tube_radius_m)
+    # The corners of a rib's end must not reach beyond a small rim.
+    room_m = math.sqrt(max(drogue.rim_radius_m**2 - (RIB_WIDTH_M / 2) ** 2, 0.0)) - thickness_m / 2
+    front[0] = min(front[0], room_m)
     ribs = []
     for angle in 2 * np.pi * (np.arange(drogue.rib_count) + 0.5) / drogue.rib_count:
         radial = np.array([np.cos(angle), np.sin(angle), 0.0])

@@ -216,6 +216,8 @@ class DrogueParameters(FrozenModel):
         if self.marker_luminance_cd_m2 > 0 and max(self.marker_emission_rgb) == 0:
             raise ValueError("marker_emission_rgb: markers that are lit need a colour above 0")
         self._check_code()
+        if self.body_mesh is not None and self.satin is not None and set(self.satin.parts) != {"coupling"}:
+            raise ValueError('satin.parts: must be ["coupling"] beside body_mesh, which counts as that')
         if self.hub is not None and self.hub.outer_radius_m >= self.coupling_radius_m:
             raise ValueError(f"coupling_radius_m: must exceed the hub's outer radius, {self.hub.outer_radius_m} m")
         if self.hose_radius_m >= self.coupling_radius_m:

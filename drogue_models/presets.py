@@ -150,7 +150,10 @@ def _expand_rings(table: dict[str, Any]) -> None:
     for key in ("marker_positions_m", "marker_depths_m"):
         if key in table:
             raise ValueError(f"{key}: leave it out, or leave out marker_rings or marker_count")
-    rings = _RINGS.validate_python(table.pop("marker_rings"))
+    try:
+        rings = _RINGS.validate_python(table.pop("marker_rings"))
+    except ValidationError as error:
+        raise ValueError(f"marker_rings: {explain(error)}") from error
     positions: list[PlanePoint] = []
     for ring in rings:
         turn = complex(math.cos(math.radians(ring.turn_deg)), math.sin(math.radians(ring.turn_deg)))

@@ -13,13 +13,17 @@ from drogue_models.presets import PRESETS
 from drogue_models.tankers.wing_with_pod import tanker_mesh
 
 RED_8 = PRESETS["red-8"]
-# What users may ask for at the edges: no hub, no ribs, many small markers, a rim thinner than the face, a deep hub.
+# What users may ask for at the edges: no hub, no ribs, many small markers, a rim thinner than the face, a deep hub,
+# ribs nearly as wide as the rim.
 UNUSUAL = (
     DrogueParameters(name="bare", marker_positions_m=even_ring(3, 0.27), hub=None, rib_count=0),
     DrogueParameters(name="many", marker_positions_m=even_ring(32, 0.27), marker_radius_m=0.02, rim_tube_radius_m=1e-3),
     DrogueParameters(name="small", marker_positions_m=even_ring(4, 0.09), marker_radius_m=0.01, rim_radius_m=0.11,
                      face_inner_radius_m=0.07, coupling_radius_m=0.05, coupling_length_m=0.01, hose_radius_m=0.02,
                      hub={"depth_m": 0.05, "inner_radius_m": 0.02, "outer_radius_m": 0.04}),
+    DrogueParameters(name="tiny", marker_positions_m=even_ring(4, 0.022), marker_radius_m=0.004, rim_radius_m=0.03,
+                     rim_tube_radius_m=5e-4, face_inner_radius_m=0.015, coupling_radius_m=0.012, hose_radius_m=0.004,
+                     hub={"depth_m": 0.02, "inner_radius_m": 0.005, "outer_radius_m": 0.01}),
 )  # fmt: skip
 ALL = (*PRESETS.values(), *UNUSUAL)
 

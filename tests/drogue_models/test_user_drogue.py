@@ -89,6 +89,11 @@ def test_long_form_of_the_positions(tmp_path: Path) -> None:
             RING + "marker_luminance_cd_m2 = 100.0\nmarker_emission_rgb = [0, 0, 0]\n",
             "marker_emission_rgb: markers that are lit need a colour above 0",
         ),
+        ('name = "mine"\nmarker_rings = 5\n', "marker_rings: Input should be a valid tuple"),
+        (
+            'name = "mine"\nmarker_rings = [{ count = 6, radius_m = -1 }]\n',
+            "marker_rings: 0.radius_m: Input should be greater than 0, got -1",
+        ),
         (RING + "body_mesh = 3\n", "body_mesh: must be the path of a mesh file, got 3"),
         (RING + 'body_mesh = "none.ply"\n', "body_mesh: .*none.ply cannot be read: No such file or directory"),
         ("name = \n", "not valid TOML"),
@@ -233,6 +238,15 @@ def test_a_hub_in_a_mesh_shows_nothing_but_its_front(tmp_path: Path) -> None:
     for radius in np.unique(np.hypot(*hub.vertices[:, :2].T).round(9)):
         assert np.abs(radii - radius).min() < 1e-9
     assert radii.min() < np.hypot(*hub.vertices[:, :2].T).min() and radii.max() == pytest.approx(0.081, abs=1e-4)
+
+
+@pytest.mark.parametrize("part", ["canopy", "ribs"])
+def test_satin_on_parts_that_a_mesh_replaces_is_refused(tmp_path: Path, part: str) -> None:
+    tube().export(tmp_path / "body.ply")
+    text = RING + 'body_mesh = "body.ply"\nsatin = { parts = ["coupling"] }\n'
+    assert load_drogue(write_toml(tmp_path, text)).satin is not None
+    with pytest.raises(ValueError, match=r'satin\.parts: must be \["coupling"\] beside body_mesh'):
+        load_drogue(write_toml(tmp_path, text.replace('"coupling"', f'"coupling", "{part}"')))
 
 
 def test_a_mesh_may_be_as_wide_as_the_rim(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.dense_matches import PixelMatches, SurfacePasses, flow_matches, stereo_matches
-from labelgen.export.export_log import ExportLog, require_pinholes, sequence_name
+from labelgen.export.export_log import ExportLog, sequence_name
 from labelgen.export.frame_files import export_image
 
 UNKNOWN_FLOW_PX = 1e10
@@ -40,7 +40,11 @@ def write_middlebury(dataset: Location, out: Path, log: ExportLog) -> list[Path]
     """
     source = Dataset(dataset)
     rig, splits = source.manifest.recipe.rig, source.manifest.split_of_frame()
-    require_pinholes(dataset, rig, "Middlebury")
+    if rig.lenses is not None:
+        raise ValueError(
+            f"{dataset}: has images of real lenses, in which a point's disparity is not along a row; render the recipe "
+            "with a rig without lenses"
+        )
     _require_depth(dataset, source)
     with new_folder(out) as folder:
         for record in log.records(source):
