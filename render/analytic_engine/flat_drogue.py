@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.meshes import FACE_THICKNESS_M
+from drogue_models.drogue_families.fittings import FACE_THICKNESS_M
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m
