@@ -167,19 +167,21 @@ def open_source(text: str, settings: CaptureSettings, rig: StereoRig, clock: Clo
     asked = settings.camera_format, settings.rate_hz
     if text.startswith(_ROS):
         topics = tuple(text.removeprefix(_ROS).split(","))
-        if len(topics) != 2 or not all(topic.startswith("/") for topic in topics):
-            raise ValueError(f"--live: must be ros:/LEFT,/RIGHT, got {text!r}")
+        if len(topics) != 2 or topics[0] == topics[1] or not all(topic.startswith("/") for topic in topics):
+            raise ValueError(f"--live: must be ros:/LEFT,/RIGHT, two topics, got {text!r}")
         if asked != (None, None):
             raise ValueError("--camera-format, --rate: with --live only devices such as 0 can be asked, not topics")
         ros = RosTopics((topics[0], topics[1]), settings.timeout_s, clock)
         return RunningCamera(ros.name, [ros], clock, settings.timeout_s, 1e-3 * settings.tolerance_ms)
     parts = text.split(",")
-    if len(parts) == 2 and "://" not in text and not Path(text).exists():
+    addresses = ["://" in part for part in parts]
+    if len(parts) == 2 and addresses[0] == addresses[1] and not Path(text).exists():
         places = [libav_place(part, (width_px, height_px), settings.timeout_s, *asked) for part in parts]
         one, other = (Path(place.url).resolve() for place in places)
         if any(place.format is None for place in places) or one == other:
+            got = ",".join(place.name for place in places)
             raise ValueError(
-                f"--live: two views must come from two devices, whose time stamps are of one clock, got {text!r}; "
+                f"--live: two views must come from two devices, whose time stamps are of one clock, got {got!r}; "
                 "join streams side by side, or use topics of ROS 2"
             )
         streams = [LibavStream(place, view, clock) for view, place in enumerate(places)]
@@ -187,5 +189,5 @@ def open_source(text: str, settings: CaptureSettings, rig: StereoRig, clock: Clo
     place = libav_place(text, (2 * width_px, height_px), settings.timeout_s, *asked)
     stream = LibavStream(place, None, clock)
     if place.is_file:
-        return VideoPlayback(stream, clock)
+        return VideoPlayback(stream, clock, settings.timeout_s)
     return RunningCamera(stream.name, [stream], clock, settings.timeout_s, 1e-3 * settings.tolerance_ms)

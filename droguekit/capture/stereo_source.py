@@ -11,6 +11,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -26,6 +27,8 @@ _OVERFLOWED = "that came faster than they could be taken"
 
 # Images that may wait to be paired; a few, so that either view may come first.
 _WAITING = 8
+# Of a view, from which its period is taken: more than half of the steps must be without a loss.
+_KNOWN_TIMES = 10
 _POLL_S = 0.1
 # How long a stream may take to close; ROS aborts a process that ends before.
 _CLOSING_S = 1.0
@@ -142,11 +145,17 @@ class StereoSource(Protocol):
 class VideoPlayback:
     """A recorded stream with both views side by side, played by its time stamps as if a camera delivered it now."""
 
-    def __init__(self, stream: ImageStream, clock: Clock) -> None:
-        """Play a stream by a clock."""
+    def __init__(self, stream: ImageStream, clock: Clock, timeout_s: float) -> None:
+        """Play a stream by a clock.
+
+        Args:
+            stream: the recording.
+            clock: for arrival times.
+            timeout_s: longest step from one pair's time stamp to the next. [s]
+        """
         self.name = stream.name
         self._left_out: Counter[str] = Counter()
-        self._stream, self._clock = stream, clock
+        self._stream, self._clock, self._timeout_s = stream, clock, timeout_s
         self._stop = threading.Event()
 
     @property
@@ -161,12 +170,18 @@ class VideoPlayback:
     def pairs(self) -> Iterator[CapturedPair]:
         """See `StereoSource`."""
         self._stream.open()
-        loader, offset_s = _PairLoader(self._left_out), None
+        loader, offset_s, last_s = _PairLoader(self._left_out), None, None
         images = self._stream.images(self._stop, self._left_out)
         for image in _ascending(images, lambda: self._left_out.update([NOT_NEWER])):
             pair = loader.load((image,), self._clock)
             if pair is None:
                 continue
+            step_s = 0.0 if last_s is None else image.time_s - last_s
+            if step_s > self._timeout_s:
+                raise ValueError(
+                    f"{self.name}: no pair came for {self._timeout_s:g} s; the next time stamp is {step_s:.6g} s later"
+                )
+            last_s = image.time_s
             offset_s = self._clock.now_s() - image.time_s if offset_s is None else offset_s
             # A file that is slow to decode is a slow camera.
             arrived_s = max(image.time_s + offset_s, self._clock.now_s())
@@ -303,7 +318,11 @@ class RunningCamera:
 
 
 class StampPairing:
-    """Finds images of left and right that were taken together."""
+    """Finds images of left and right that were taken together.
+
+    After a loss, the image before or after may be within the tolerance too. So images are a pair only where they differ
+    by less than half the period between images of a view; nothing nearer can come then.
+    """
 
     def __init__(self, tolerance_s: float, left_out: Counter[str]) -> None:
         """Start without images.
@@ -314,35 +333,41 @@ class StampPairing:
         """
         self._tolerance_s, self._left_out = tolerance_s, left_out
         self._views: tuple[deque[CapturedImage], deque[CapturedImage]] = (deque(), deque())
-        self._nearest_s: float | None = None
+        self._times_s: tuple[deque[float], deque[float]] = (deque(maxlen=_KNOWN_TIMES), deque(maxlen=_KNOWN_TIMES))
 
     def add(self, image: CapturedImage) -> tuple[CapturedImage, CapturedImage] | None:
         """Add the next image of its view.
 
         Returns:
-            The left and the right image of a new pair; older images without a partner are dropped. None where the
-            image waits for its partner.
+            The left and the right image of a new pair; older images without a partner are dropped. None where images
+            wait for their partners: the first ones also for the period, unless their time stamps are equal.
         """
         assert image.view is not None
-        own, other = self._views[image.view], self._views[1 - image.view]
-        partner = min(other, key=lambda each: abs(each.time_s - image.time_s), default=None)
-        if partner is not None:
-            difference_s = abs(partner.time_s - image.time_s)
-            self._nearest_s = difference_s if self._nearest_s is None else min(self._nearest_s, difference_s)
-        if partner is None or difference_s > self._tolerance_s:
-            own.append(image)
+        self._times_s[image.view].append(image.time_s)
+        own = self._views[image.view]
+        own.append(image)
+        pair = self._nearest()
+        if pair is None or not self._are_together(_difference_s(pair)):
             if len(own) > _WAITING:
                 own.popleft()
                 self._left_out[_ALONE] += 1
             return None
-        alone = len(own) + other.index(partner)
-        if alone:
-            self._left_out[_ALONE] += alone
-        own.clear()
-        self._nearest_s = None
-        while other.popleft() is not partner:
-            pass
-        return (image, partner) if image.view == 0 else (partner, image)
+        for view, partner in zip(self._views, pair, strict=True):
+            while view.popleft() is not partner:
+                self._left_out[_ALONE] += 1
+        return pair
+
+    def _nearest(self) -> tuple[CapturedImage, CapturedImage] | None:
+        left, right = self._views
+        return min(product(left, right), key=_difference_s, default=None)
+
+    def _are_together(self, difference_s: float) -> bool:
+        return difference_s == 0 or (difference_s <= self._tolerance_s and 2 * difference_s < self._period_s())
+
+    def _period_s(self) -> float:
+        """Of the faster view, whatever images were lost or late; 0 while it is not known. [s]"""
+        steps_s = [np.diff(times_s) for times_s in self._times_s if len(times_s) > 1]
+        return min((float(np.median(each)) for each in steps_s), default=0.0)
 
     def advice(self) -> str:
         """What keeps images from becoming pairs, as the end of a sentence; empty where nothing is known."""
@@ -351,11 +376,18 @@ class StampPairing:
             return ""
         if not all(counts):
             return f"; only the {'left' if counts[0] else 'right'} camera delivers"
-        assert self._nearest_s is not None
+        nearest = self._nearest()
+        assert nearest is not None
+        difference_s = _difference_s(nearest)
+        remedy = ", or allow the difference by --stamp-tolerance-ms" if difference_s > self._tolerance_s else ""
         return (
-            f"; the time stamps of left and right differ by {1e3 * self._nearest_s:.3g} ms or more: trigger both "
-            "cameras together, or allow the difference by --stamp-tolerance-ms"
+            f"; the time stamps of left and right differ by {1e3 * difference_s:.3g} ms or more: trigger both cameras "
+            f"together{remedy}"
         )
+
+
+def _difference_s(pair: tuple[CapturedImage, CapturedImage]) -> float:
+    return abs(pair[0].time_s - pair[1].time_s)
 
 
 class _PairLoader:

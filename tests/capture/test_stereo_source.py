@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from droguekit.capture.libav_stream import LibavPlace, LibavStream
-from droguekit.capture.stereo_source import CapturedImage, LoadedImage, RunningCamera, StampPairing
+from droguekit.capture.stereo_source import CapturedImage, LoadedImage, RunningCamera, StampPairing, VideoPlayback
 from nav.realtime import MonotonicClock
 from tests.support.live_streams import FFV1, encode, serve
 
@@ -47,6 +47,27 @@ def test_views_of_cameras_that_are_not_triggered_together_are_no_pairs() -> None
     pairs, left_out, _ = paired(images, 0.0131)
     assert len(pairs) == 40
     assert all(right - left == pytest.approx(0.013) for left, right in pairs)
+
+
+@pytest.mark.parametrize("views", [(0, 1), (1, 0)])
+@pytest.mark.parametrize("lost", [(0, 0), (1, 0), (0, 3), (1, 3), (1, 7)])
+@pytest.mark.parametrize("offset_s", [0.0, 0.013])
+def test_after_a_loss_no_image_takes_a_partner_of_the_next_period(
+    views: tuple[int, int], lost: tuple[int, int], offset_s: float
+) -> None:
+    # At 25 Hz neighbours are within the tolerance too.
+    taken = [(view, index) for index in range(10) for view in views if (view, index) != lost]
+    pairs, left_out, _ = paired([image(view, 0.04 * index + offset_s * view) for view, index in taken], 0.041)
+    assert [left for left, _ in pairs] == pytest.approx([0.04 * index for index in range(10) if index != lost[1]])
+    assert all(right - left == pytest.approx(offset_s) for left, right in pairs)
+    assert left_out == {"without a partner": 1}
+
+
+def test_images_midway_between_those_of_the_other_view_are_no_pairs() -> None:
+    images = [image(view, (2 * index + view) / 64) for index in range(20) for view in (0, 1)]
+    pairs, _, advice = paired(images, 0.02)
+    assert pairs == []
+    assert advice.endswith("differ by 15.6 ms or more: trigger both cameras together")
 
 
 def test_after_a_pair_the_advice_is_of_what_came_since() -> None:
@@ -91,6 +112,27 @@ def test_pairs_that_never_come_are_explained_after_the_time_limit() -> None:
     camera = RunningCamera("two", [left, right], MonotonicClock(), 0.3, 0.001)
     with pytest.raises(ValueError, match=r"^two: no pair came for 0.3 s; the time stamps .* differ by 13 ms or more"):
         next(camera.pairs())
+
+
+class Skipping:
+    """A clock on which waiting takes no time."""
+
+    time_s = 0.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def wait_until(self, time_s: float, stop: threading.Event) -> None:
+        self.time_s = time_s
+
+
+def test_a_video_ends_where_its_next_time_stamp_is_beyond_the_time_limit() -> None:
+    # A day later, as by one bad number in a file.
+    images = [image(None, time_s) for time_s in (7.0, 11.9, 12.0, 86412.0, 86412.04)]
+    pairs = VideoPlayback(Listed("flight.mkv", images), Skipping(), 5.0).pairs()
+    assert [next(pairs).time_s for _ in range(3)] == [7.0, 11.9, 12.0]
+    with pytest.raises(ValueError, match=r"^flight.mkv: no pair came for 5 s; the next time stamp is 86400 s later$"):
+        next(pairs)
 
 
 class Unstamped(Listed):
