@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -28,8 +29,11 @@ if TYPE_CHECKING:
 
 # AVFMT_NOTIMESTAMPS: the format has none, and the library invents them from a guessed rate.
 _HAS_NO_STAMPS = 0x80
-# AVCOL_SPC_BT709, _SMPTE170M and AVCOL_RANGE_MPEG, _JPEG: matrices and ranges of Y, Cb, Cr.
+# AVCOL_SPC_BT709, _UNSPECIFIED, _FCC, _BT470BG, _SMPTE170M, _SMPTE240M, _BT2020_NCL: matrices of Y, Cb, Cr as ITU-T
+# H.273 numbers them, and swscale's number of each.
 _BT709, _BT601 = 1, 5
+_MATRICES = {1: _BT709, 2: _BT601, 4: 4, 5: _BT601, 6: _BT601, 7: 7, 9: 9}
+# AVCOL_RANGE_MPEG, _JPEG.
 _LIMITED, _FULL = 1, 2
 # SWS_BILINEAR, _ACCURATE_RND and _FULL_CHR_H_INT; without the latter two, numbers are off by up to two.
 _CONVERSION = 0x2 | 0x40000 | 0x2000
@@ -100,6 +104,13 @@ class LibavStream:
         except ValueError:
             self._container.close()
             raise
+        decoder = self._container.streams.video[0].codec_context
+        if decoder.name == "h264":
+            # It marks images with parts that it made up only where one thread decodes each; and by the option below,
+            # it refuses images for remarks (SEI) in which makers of cameras are careless.
+            decoder.thread_count = 1
+        else:
+            decoder.options = {"err_detect": "crccheck+explode"}
 
     def _check_container(self, container: InputContainer) -> None:
         count = len(container.streams.video)
@@ -217,7 +228,7 @@ def pixels_of_frame(frame: VideoFrame, name: str) -> LoadedImage:
     the matrix and the range that the frame names, or by those of BT.601 and limited range where it names none.
 
     Raises:
-        ValueError: another pixel format; names the stream.
+        ValueError: another pixel format or matrix; names the stream.
     """
     kind, bits = frame.format.name, {component.bits for component in frame.format.components}
     if kind == "gray":
@@ -235,7 +246,13 @@ def pixels_of_frame(frame: VideoFrame, name: str) -> LoadedImage:
         raise ValueError(f"{name}: images of the format {kind} are not read; send RGB, grey, or 8-bit YUV")
     if frame.format.is_rgb:
         return LoadedImage(_as_bytes(frame.reformat(format="rgb24")))
-    matrix = _BT709 if frame.colorspace == _BT709 else _BT601
+    named = int(frame.colorspace)
+    matrix = _MATRICES.get(named)
+    if matrix is None:
+        raise ValueError(
+            f"{name}: colours by the matrix {named} of ITU-T H.273 are not read; send RGB, grey, or YUV of BT.601, "
+            "BT.709 or BT.2020"
+        )
     is_full = frame.color_range == _FULL or kind.startswith("yuvj")
     converted = frame.reformat(
         format="rgb24",
@@ -271,7 +288,8 @@ def libav_place(
     device = Path(f"/dev/video{source}") if source.isdecimal() else Path(source)
     is_device = source.isdecimal() or device.is_char_device()
     if not is_device and (camera_format is not None or rate_hz is not None):
-        raise ValueError(f"--camera-format, --rate: with --live only devices such as 0 can be asked, got {source}")
+        got = without_secrets(source)
+        raise ValueError(f"--camera-format, --rate: with --live only devices such as 0 can be asked, got {got}")
     if is_device:
         if not device.exists():
             there = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*"))) or "no video devices"
@@ -285,14 +303,23 @@ def libav_place(
     if "://" in source:
         # Over UDP, which is RTSP's default, a lost packet damages images until the next key frame.
         options = {"rtsp_flags": "prefer_tcp"} if source.startswith("rtsp") else {}
-        return LibavPlace(without_password(source), source, None, options, timeout_s)
+        return LibavPlace(without_secrets(source), source, None, options, timeout_s)
     if not device.exists():
         raise ValueError(f"--live: there is no file {source}; give a device's number, a video file or an address")
-    return LibavPlace(source, source, is_file=device.is_file(), timeout_s=None if device.is_file() else timeout_s)
+    # Without the scheme, libav takes what is before a colon in the name for one.
+    is_file = device.is_file()
+    return LibavPlace(source, f"file:{source}", is_file=is_file, timeout_s=None if is_file else timeout_s)
 
 
-def without_password(address: str) -> str:
-    """An address as it may be printed."""
-    scheme, separator, rest = address.partition("://")
-    login, at, host = rest.rpartition("@")
-    return f"{scheme}{separator}{host}" if at and "/" not in login else address
+def without_secrets(address: str) -> str:
+    """An address as it may be printed: without user, password and query."""
+    if "://" not in address:
+        return address
+    try:
+        parts = urlsplit(address)
+        _ = parts.port
+    except ValueError:
+        # Letters where the port should be are the rest of a password, which has a / or the like in it.
+        return f"{address.partition('://')[0]}://..."
+    query = "?..." if parts.query or parts.fragment else ""
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}{query}"

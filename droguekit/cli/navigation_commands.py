@@ -280,7 +280,8 @@ BlackLevelOption = Annotated[
 ]
 BitsOption = Annotated[int | None, typer.Option(help="With --live: bits that the camera uses of 16-bit numbers.")]
 TimeoutOption = Annotated[
-    float | None, typer.Option(metavar="S", help="With --live: end when no pair comes for so long; 5 by default.")
+    float | None,
+    typer.Option(metavar="S", help="With --live: end when no pair comes for so long, in a video too; 5 by default."),
 ]
 StampToleranceOption = Annotated[
     float | None,

@@ -167,7 +167,7 @@ def navigate_live(
                 fault = error.strerror or str(error)
         if not tally.pairs and fault is None:
             file.remove()
-            raise ValueError(pairs.fault or f"--live: {live.source}: delivered no pair")
+            raise ValueError(pairs.fault or f"--live: {source.name}: delivered no pair")
         latency = tally.report(pairs.rate_hz, dict(pairs.source.left_out))
         if options.latency_out is not None:
             try:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from droguekit.capture.libav_stream import LibavPlace, LibavStream, pixels_of_frame, without_password
+from droguekit.capture.libav_stream import LibavPlace, LibavStream, libav_place, pixels_of_frame, without_secrets
 from droguekit.capture.stereo_source import DAMAGED, CapturedImage
 from nav.realtime import MonotonicClock
 from tests.support.live_streams import FFV1, FFV1_DEEP, FFV1_GREY, Codec, encode
@@ -93,12 +93,18 @@ def even_frame(kind: str, matrix: int, color_range: int) -> av.VideoFrame:
 
 
 @pytest.mark.parametrize("kind", ["yuv444p", "yuvj444p", "yuv420p", "yuv422p"])
-@pytest.mark.parametrize(("matrix", "red", "blue"), [(2, 0.299, 0.114), (5, 0.299, 0.114), (1, 0.2126, 0.0722)])
+@pytest.mark.parametrize(
+    ("matrix", "red", "blue"),
+    [
+        *((matrix, 0.299, 0.114) for matrix in (2, 5, 6)),
+        *((1, 0.2126, 0.0722), (4, 0.30, 0.11), (7, 0.212, 0.087), (9, 0.2627, 0.0593)),
+    ],
+)
 @pytest.mark.parametrize("color_range", [0, 1, 2])
 def test_luma_and_chroma_are_converted_by_the_matrix_and_range_that_they_name(
     kind: str, matrix: int, red: float, blue: float, color_range: int
 ) -> None:
-    # ITU-R BT.601-7 and BT.709-6, section 3: weights of red and blue in Y, and the ranges of 8 bits.
+    # ITU-T H.273, table 4: weights of red and blue in Y. ITU-R BT.601-7 and BT.709-6, section 3: the ranges of 8 bits.
     luma, cb, cr = (float(level) for level in LEVELS)
     if color_range == 2 or kind.startswith("yuvj"):
         luma, cb, cr = luma, (cb - 128) / 255, (cr - 128) / 255
@@ -114,6 +120,12 @@ def test_luma_and_chroma_are_converted_by_the_matrix_and_range_that_they_name(
 def test_other_formats_are_named(kind: str) -> None:
     with pytest.raises(ValueError, match=f"camera: images of the format {kind} are not read; send RGB, grey, or 8-bit"):
         pixels_of_frame(av.VideoFrame(64, 48, kind), "camera")
+
+
+@pytest.mark.parametrize("matrix", [0, 3, 8, 10])
+def test_other_matrices_are_named(matrix: int) -> None:
+    with pytest.raises(ValueError, match=rf"camera: colours by the matrix {matrix} of ITU-T H.273 are not read"):
+        pixels_of_frame(even_frame("yuv444p", matrix, 1), "camera")
 
 
 def moving(seed: int) -> list[np.ndarray]:
@@ -144,6 +156,45 @@ def test_after_lost_packets_no_image_is_used_that_was_built_on_them(
     assert len(lost) < 10 or left_out[DAMAGED] > 0
 
 
+@pytest.mark.parametrize(
+    ("codec", "intra"),
+    [
+        (Codec("matroska", "libx264", "yuv420p", {"tune": "zerolatency", "g": "5", "slices": "4"}), False),
+        (
+            Codec(
+                "matroska",
+                "libx265",
+                "yuv420p",
+                {"tune": "zerolatency", "x265-params": "keyint=5:hash=1:log-level=none"},
+            ),
+            False,
+        ),
+        (Codec("matroska", "mjpeg", "yuvj420p"), True),
+    ],
+    ids=["h264 in slices", "h265 with hashes", "mjpeg"],
+)
+@pytest.mark.parametrize("damaged", [0, 5, 7])
+def test_an_image_of_damaged_data_and_those_built_on_it_are_left_out(
+    codec: Codec, intra: bool, damaged: int, tmp_path: Path
+) -> None:
+    """No container and no protocol tells of it, only the decoder."""
+    whole, broken = tmp_path / "whole.mkv", tmp_path / "broken.mkv"
+    encode(str(whole), moving(0)[:15], codec)
+    with av.open(str(whole)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        first = packets[damaged].pos + packets[damaged].size * 7 // 10
+    data = bytearray(whole.read_bytes())
+    data[first : first + 20] = bytes(each ^ 0x5A for each in data[first : first + 20])
+    broken.write_bytes(data)
+    images = {each.time_s: each.load().pixels for each in images_of(whole)[0]}
+    captured, left_out = images_of(broken)
+    for each in captured:
+        np.testing.assert_array_equal(each.load().pixels, images[each.time_s])
+    lost = [damaged] if intra else range(damaged, 5 * (damaged // 5) + 5)
+    assert [round(25 * each.time_s) for each in captured] == [index for index in range(15) if index not in lost]
+    assert left_out[DAMAGED] > 0
+
+
 def test_a_file_with_two_streams_without_stamps_or_turned_is_refused(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "two.mkv"), "w") as container:
         streams: list[Any] = [container.add_stream("ffv1", rate=25) for _ in range(2)]
@@ -165,10 +216,27 @@ def test_a_file_with_two_streams_without_stamps_or_turned_is_refused(tmp_path: P
         ("rtsp://me:secret@camera:554/stereo", "rtsp://camera:554/stereo"),
         ("http://camera/a@b", "http://camera/a@b"),
         ("udp://127.0.0.1:5000", "udp://127.0.0.1:5000"),
+        ("rtsp://me:secret@camera/stereo@main", "rtsp://camera/stereo@main"),
+        ("rtsp://me:sec@ret@camera/stereo", "rtsp://camera/stereo"),
+        ("rtsp://me:sec/ret@camera/stereo", "rtsp://..."),
+        ("rtsp://me:sec?ret@camera/stereo", "rtsp://..."),
+        ("http://[::1]:80/video?user=me&password=secret", "http://[::1]:80/video?..."),
+        ("/dev/video0", "/dev/video0"),
     ],
 )
 def test_a_password_is_not_printed(address: str, printed: str) -> None:
-    assert without_password(address) == printed
+    assert without_secrets(address) == printed
+
+
+def test_a_file_may_have_a_colon_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = "12:30:00.mkv"
+    with Path(name).open("wb") as file:
+        encode(file, [COLORS])
+    stream = LibavStream(libav_place(name, (64, 48), 5.0, None, None), None, MonotonicClock())
+    stream.open()
+    assert stream.name == name
+    assert len(list(stream.images(threading.Event(), Counter()))) == 1
 
 
 def test_the_wait_between_the_last_images_is_no_decoding(tmp_path: Path) -> None:
