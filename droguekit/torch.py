@@ -19,7 +19,9 @@ The last three are missing where a dataset has no truth.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +161,10 @@ class PairDataset(MapDataset[Any]):
         Raises:
             IndexError: no such position.
             ValueError: a file is missing or damaged; names it.
+            TypeError: a slice.
         """
+        if isinstance(index, slice):
+            raise TypeError("index: must be one position; slice the pairs before, as in PairDataset(pairs[0:2])")
         sample = sample_of_pair(self.dataset[index], self.dataset.has_truth, self._keypoints)
         return sample if self._transform is None else self._transform(sample)
 
@@ -206,8 +211,8 @@ class RenderStream(IterableDataset[Any]):
                 used.
             OSError: the folder cannot be written.
         """
-        if "://" in str(cache):
-            raise ValueError(f"cache: must be a folder of this machine, got {cache}")
+        if "://" in str(cache) or not str(cache).strip():
+            raise ValueError(f"cache: must be a folder of this machine, got {str(cache)!r}")
         if replays < 0:
             raise ValueError(f"replays: must not be negative, got {replays}")
         if not 0 <= rank < ranks:
@@ -229,7 +234,7 @@ class RenderStream(IterableDataset[Any]):
         Args:
             epoch: counted from 0; each has its own order of earlier frames.
             batches_done: number of batches of this epoch that this rank's data loader has delivered.
-            batch_size: of the data loader.
+            batch_size: of the data loader, which must not drop incomplete batches (`drop_last`).
 
         Raises:
             ValueError: a negative number, or an empty batch.
@@ -248,9 +253,8 @@ class RenderStream(IterableDataset[Any]):
         """
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        # A data loader takes batches from its processes in turn.
-        done = len(range(worker, self._batches_done, workers)) * self._batch_size
-        shard = self._rank * workers + worker
+        place, done = self._place(worker, workers)
+        shard = self._rank * workers + place
         reader = Dataset(self.cache)
         task = FrameTask(self._recipe, self.cache, next(iter(reader.manifest.engines), None), device=self._device)
         for frame_index in self.frame_order(shard, self._ranks * workers, done):
@@ -259,6 +263,21 @@ class RenderStream(IterableDataset[Any]):
             sample = sample_of_pair(stored_pair(reader, frame_index), keypoints=_most_markers(self._recipe))
             yield sample if self._transform is None else self._transform(sample)
         self._describe(reader.manifest, range(self._rank * workers, (self._rank + 1) * workers), self._ranks * workers)
+
+    def _place(self, worker: int, workers: int) -> tuple[int, int]:
+        """Whose part of the frames a process of this rank goes on with, and how many of its samples are done.
+
+        A data loader takes batches from its processes in turn, from the first one on, and passes over those at their
+        end. So the first process takes the part whose turn it is.
+        """
+        batches = [
+            -(-self._samples(self._rank * workers + place, self._ranks * workers) // self._batch_size)
+            for place in range(workers)
+        ]
+        turns = (place for turn in range(max(batches)) for place in range(workers) if turn < batches[place])
+        done = Counter(islice(turns, self._batches_done))
+        place = (next(turns, 0) + worker) % workers
+        return place, done[place] * self._batch_size
 
     def _describe(self, manifest: Manifest, own_shards: range, shards: int) -> None:
         """Write manifest and annotations of the cache, once no process has a frame of this rank to make any more."""
@@ -280,10 +299,14 @@ class RenderStream(IterableDataset[Any]):
             start: position to begin at.
         """
         own = range(shard, self._recipe.frames.count, shards)
-        for position in range(start, len(own) * (1 + self._replays)):
+        for position in range(start, self._samples(shard, shards)):
             newest, replay = divmod(position, 1 + self._replays)
             if replay == 0:
                 yield own[newest]
             else:
                 rng = sample_generator(self._recipe.seed, self._epoch, position, f"replay {shard} of {shards}")
                 yield own[int(rng.integers(newest + 1))]
+
+    def _samples(self, shard: int, shards: int) -> int:
+        """How many samples a process shows in an epoch."""
+        return len(range(shard, self._recipe.frames.count, shards)) * (1 + self._replays)

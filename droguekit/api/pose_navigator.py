@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from pathlib import Path
 from typing import Literal
 
@@ -126,9 +127,15 @@ class Navigator:
         Args:
             images: such as `StereoPair.images`.
             frame_index: that the estimate gets; pairs are counted from 0 without it.
+
+        Raises:
+            ValueError: a negative index.
+            TypeError: an index that is no whole number.
         """
-        index = self._next_index if frame_index is None else frame_index
-        self._next_index = index + 1
+        index = self._next_index if frame_index is None else operator.index(frame_index)
+        if index < 0:
+            raise ValueError(f"frame_index: must not be negative, got {index}")
         with one_thread():
             estimates = self._navigator.process(BlindPair(index, images, self.rig, self.drogue)).estimates
+        self._next_index = index + 1
         return estimates[-1]

@@ -53,7 +53,9 @@ def render_pair(recipe: Recipe, frame: int = 0, *, device: Device = "cpu") -> St
 
     Raises:
         ValueError: an index outside the recipe, or an engine or device that cannot be used.
+        TypeError: an index that is no whole number.
     """
+    frame = operator.index(frame)
     with one_thread():
         rendered = render_frame(recipe, frame, process_engine(recipe.render.engine, device))
     spec = rendered.record.frame
@@ -81,12 +83,12 @@ def render_dataset(
 
     Raises:
         ValueError: frames outside the recipe, a folder of another recipe, or an engine or device that cannot be used.
-        TypeError: an index of a frame that is no whole number.
+        TypeError: an index of a frame, or a number of workers, that is no whole number.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
         KeyboardInterrupt: stopped by the user; finished frames stay, and a second call goes on.
     """
     chosen = range(recipe.frames.count) if frames is None else [operator.index(index) for index in frames]
-    if workers is not None and workers < 0:
+    if workers is not None and operator.index(workers) < 0:
         raise ValueError(f"workers: must not be negative, got {workers}")
     options = ExecutionOptions(workers, device=device)
     datasets.render_dataset(

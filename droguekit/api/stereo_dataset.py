@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import operator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol, overload
@@ -14,7 +16,7 @@ from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.image_codecs import read_passes
 from datasets_manifest.storage.layout import BLIND_FILE, passes_file
 from datasets_manifest.storage.reader import Dataset, read_sought_drogue
-from datasets_manifest.storage.storage import open_storage
+from datasets_manifest.storage.storage import Location, as_location, open_storage
 from datasets_manifest.types.images import Pixels, StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
@@ -49,6 +51,8 @@ class PairContents(Protocol):
 class StereoPair:
     """One stereo pair with its truth. Every part is read at its first use and kept.
 
+    Pairs are equal where they are the same pair of the same dataset.
+
     Attributes:
         frame_index: in the dataset or in the recipe.
         rig: the cameras.
@@ -63,6 +67,12 @@ class StereoPair:
     def __repr__(self) -> str:
         """Name and frame."""
         return f"StereoPair(frame_index={self.frame_index})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StereoPair) and self._source == other._source
+
+    def __hash__(self) -> int:
+        return hash(self._source)
 
     @cached_property
     def images(self) -> StereoImages:
@@ -130,32 +140,31 @@ class StereoPair:
         return {eye: self._source.depth_m(eye) for eye in EYES}
 
 
+@dataclass(frozen=True)
 class _StoredPair:
     """A pair of a dataset on disk."""
 
-    def __init__(self, dataset: Dataset, frame_index: int) -> None:
-        self._dataset, self._index = dataset, frame_index
+    dataset: Dataset = field(compare=False)
+    path: Location
+    frame_index: int
 
     def images(self) -> StereoImages:
-        return self._dataset.images(self._index)
+        return self.dataset.images(self.frame_index)
 
     def record(self) -> PairRecord:
-        return self._dataset.record(self._index)
+        return self.dataset.record(self.frame_index)
 
     def part_id(self, eye: Eye) -> NDArray[np.uint8]:
-        return self._dataset.part_ids(self._index, eye)
+        return self.dataset.part_ids(self.frame_index, eye)
 
     def depth_m(self, eye: Eye) -> NDArray[np.float32]:
         # A hostile file could harm the decoder: only what the record describes is read.
-        _, files = self._dataset.whole_frame(self._index)
+        _, files = self.dataset.whole_frame(self.frame_index)
         name = passes_file(eye)
+        where = self.dataset.frames.where(self.frame_index, name)
         if name not in files:
-            raise ValueError(
-                f"{self._dataset.frames.where(self._index, name)}: is missing; render with `[outputs] exr = true` "
-                "in the recipe to store depths"
-            )
-        where = self._dataset.frames.where(self._index, name)
-        return read_passes(files[name], where, self._dataset.manifest.recipe.rig.camera)["depth.Z"]
+            raise ValueError(f"{where}: is missing; render with `[outputs] exr = true` in the recipe to store depths")
+        return read_passes(files[name], where, self.dataset.manifest.recipe.rig.camera)["depth.Z"]
 
 
 def stored_pair(dataset: Dataset, frame_index: int) -> StereoPair:
@@ -168,17 +177,19 @@ def stored_pair(dataset: Dataset, frame_index: int) -> StereoPair:
     drogue = recipe.drogue
     if recipe.variants:
         drogue = read_sought_drogue(dataset.frames, frame_index, recipe.drogue)
-    return StereoPair(frame_index, recipe.rig, drogue, _StoredPair(dataset, frame_index))
+    return StereoPair(frame_index, recipe.rig, drogue, _StoredPair(dataset, dataset.path, frame_index))
 
 
+@dataclass(frozen=True)
 class _BlindSource:
     """A pair of a dataset without truth."""
 
-    def __init__(self, dataset: BlindDataset, path: str, frame_index: int) -> None:
-        self._dataset, self._path, self._index = dataset, path, frame_index
+    dataset: BlindDataset = field(compare=False)
+    path: str
+    frame_index: int
 
     def images(self) -> StereoImages:
-        return self._dataset.pair(self._index).images
+        return self.dataset.pair(self.frame_index).images
 
     def record(self) -> PairRecord:
         raise self._no_truth()
@@ -190,7 +201,7 @@ class _BlindSource:
         raise self._no_truth()
 
     def _no_truth(self) -> ValueError:
-        return ValueError(f"{self._path}: is a blind dataset: it has images, rig and drogue, but no truth")
+        return ValueError(f"{self.path}: is a blind dataset: it has images, rig and drogue, but no truth")
 
 
 class StereoDataset(Sequence[StereoPair]):
@@ -203,7 +214,7 @@ class StereoDataset(Sequence[StereoPair]):
         frame_indices: of the pairs, in ascending order, or in the order of the selection.
     """
 
-    def __init__(self, path: str | Path, frame_indices: Collection[int] | None = None) -> None:
+    def __init__(self, path: str | Path, frame_indices: Iterable[int] | None = None) -> None:
         """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
 
         Args:
@@ -212,16 +223,18 @@ class StereoDataset(Sequence[StereoPair]):
 
         Raises:
             ValueError: no such place, nothing in it that can be trusted, or a pair that it does not have.
+            TypeError: an index of a pair that is no whole number.
         """
         self.path = str(path)
-        location = self.path if "://" in self.path else Path(path)
+        location = as_location(path) if isinstance(path, str) else path
         self._blind = BlindDataset(location)
         self._dataset = None if open_storage(location).exists(BLIND_FILE) else Dataset(location)
         known = self._blind.frame_indices
-        unknown = [] if frame_indices is None else sorted(set(frame_indices) - set(known))
+        chosen = known if frame_indices is None else map(operator.index, frame_indices)
+        self.frame_indices: tuple[int, ...] = tuple(dict.fromkeys(chosen))
+        unknown = sorted(self._positions - set(known))
         if unknown:
             raise ValueError(f"{self.path}: has no pair {unknown[0]}")
-        self.frame_indices: tuple[int, ...] = known if frame_indices is None else tuple(dict.fromkeys(frame_indices))
 
     def __repr__(self) -> str:
         """Place and number of pairs."""
@@ -284,7 +297,9 @@ class StereoDataset(Sequence[StereoPair]):
 
         Raises:
             ValueError: this dataset, or this part of it, has no such frame; or its record is damaged.
+            TypeError: the index is no whole number.
         """
+        frame_index = operator.index(frame_index)
         if frame_index not in self._positions:
             raise ValueError(f"{self.path}: has no pair {frame_index}")
         if self._dataset is not None:
@@ -313,8 +328,11 @@ class StereoDataset(Sequence[StereoPair]):
             with_drogue: True for pairs that show a drogue, False for those without.
 
         Raises:
-            ValueError: the dataset has no truth, a split or family that it cannot have, or a damaged record.
+            ValueError: the dataset has no truth, distances that do not ascend, a split or family that it cannot have,
+                or a damaged record.
         """
+        if distance_m is not None and not distance_m[0] <= distance_m[1]:
+            raise ValueError(f"distance_m: must be the least and the largest distance, got {distance_m}")
         manifest = self.reader.manifest
         families = [each.name for each in manifest.recipe.families] or [manifest.recipe.family]
         if family is not None and family not in families:

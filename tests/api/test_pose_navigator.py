@@ -81,6 +81,18 @@ def test_a_time_that_is_no_number_is_refused(time_s: float, tracker: str | None,
     assert navigator(empty, empty, time_s=1.0).frame_index == 0
 
 
+def test_a_refused_index_does_not_count(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    navigator = droguekit.Navigator(dataset.rig, dataset.drogue)
+    images = dataset[0].images
+    assert navigator.estimate(images, np.int64(3)).frame_index == 3
+    with pytest.raises(ValueError, match=r"^frame_index: must not be negative, got -3$"):
+        navigator.estimate(images, -3)
+    with pytest.raises(TypeError, match="integer"):
+        navigator.estimate(images, 1.5)  # type: ignore[arg-type]
+    assert navigator.estimate(images).frame_index == 4
+
+
 def test_blinking_lamps_need_the_time() -> None:
     """Their code is in the time of the pair, and a made-up one tells a wrong roll."""
     code = MarkerCode(slot_s=0.04, patterns=("01111111",))

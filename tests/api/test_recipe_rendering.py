@@ -50,6 +50,10 @@ def test_a_dataset_is_rendered_to_a_url_with_indices_of_any_whole_type() -> None
     assert [pair.frame_index for pair in dataset] == [1, 2] and dataset.path == place
     with pytest.raises(TypeError, match="integer"):
         droguekit.render_dataset(recipe, place, frames=[0.0], workers=0)  # type: ignore[list-item]
+    with pytest.raises(TypeError, match="integer"):
+        droguekit.render_dataset(recipe, place, workers=1.5)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="integer"):
+        droguekit.render_pair(recipe, 1.5)  # type: ignore[arg-type]
 
 
 def test_changes_replace_what_they_name_and_nothing_else() -> None:

@@ -71,6 +71,26 @@ def test_selections_are_those_of_the_records(pairs: StereoDataset, pairs_folder:
     assert len(set(split.values())) > 1
 
 
+def test_indices_may_be_any_whole_numbers_in_any_collection(pairs: StereoDataset) -> None:
+    assert StereoDataset(pairs.path, (index for index in (3, 1))).frame_indices == (3, 1)
+    assert StereoDataset(pairs.path, np.array([3, 1])).frame_indices == (3, 1)
+    assert pairs.frame(np.int64(3)).frame_index == 3
+    with pytest.raises(TypeError, match="integer"):
+        StereoDataset(pairs.path, [1.0])  # type: ignore[list-item]
+    with pytest.raises(TypeError, match="integer"):
+        pairs.frame(1.0)  # type: ignore[arg-type]
+
+
+def test_a_dataset_knows_its_pairs(pairs: StereoDataset, pairs_folder: Path, tmp_path: Path) -> None:
+    write_export("blind", pairs_folder, tmp_path / "blind", ExportLog())
+    blind = droguekit.open_dataset(tmp_path / "blind")
+    for dataset, other in ((pairs, blind), (blind, pairs)):
+        assert dataset[3] in dataset and dataset[3] in dataset[2:] and dataset[3] not in dataset[:3]
+        assert dataset[1:].index(dataset[3]) == 2
+        assert other[3] not in dataset and "a word" not in dataset
+        assert len({dataset[3], dataset[3], dataset[4]}) == 2
+
+
 def test_a_slice_keeps_its_order(pairs: StereoDataset) -> None:
     assert pairs[::-1].frame_indices == pairs.frame_indices[::-1]
 
@@ -80,6 +100,9 @@ def test_wrong_selections_are_refused(pairs: StereoDataset) -> None:
         pairs.select(family="storm")
     with pytest.raises(ValueError, match="split: must be train, val or test, got 'dev'"):
         pairs.select(split="dev")  # type: ignore[arg-type]
+    for wrong in ((5.0, 2.0), (float("nan"), 2.0), (2.0, float("nan"))):
+        with pytest.raises(ValueError, match=r"distance_m: must be the least and the largest distance, got \("):
+            pairs.select(distance_m=wrong)
 
 
 def test_a_blind_dataset_has_images_but_no_truth(pairs: StereoDataset, pairs_folder: Path, tmp_path: Path) -> None:
@@ -102,6 +125,13 @@ def test_a_blind_dataset_has_images_but_no_truth(pairs: StereoDataset, pairs_fol
 def test_depths_that_were_not_stored_are_explained(smoke_dataset: Path) -> None:
     with pytest.raises(ValueError, match=r"is missing; render with `\[outputs\] exr = true`"):
         _ = droguekit.open_dataset(smoke_dataset)[0].depth_m
+
+
+def test_an_empty_path_is_not_the_current_folder(pairs_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(pairs_folder)
+    assert len(droguekit.open_dataset(".")) == 8
+    with pytest.raises(ValueError, match="must be a folder or a URL, got ''"):
+        droguekit.open_dataset("")
 
 
 def test_a_missing_dataset_is_one_line(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import shutil
 from collections import Counter
 from multiprocessing.context import BaseContext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -109,9 +110,16 @@ def test_drogues_of_unlike_numbers_of_markers_stack_in_one_batch(tmp_path: Path)
             assert points[:, own.shape[1] :, :2].isnan().all() and not points[:, own.shape[1] :, 2].any()
 
 
-def test_a_stream_needs_a_folder_of_this_machine(recipe: Recipe) -> None:
-    with pytest.raises(ValueError, match=r"cache: must be a folder of this machine, got s3://bucket/name"):
-        RenderStream(recipe, "s3://bucket/name")
+@pytest.mark.parametrize("cache", ["s3://bucket/name", ""])
+def test_a_stream_needs_a_folder_of_this_machine(cache: str, recipe: Recipe) -> None:
+    with pytest.raises(ValueError, match=rf"cache: must be a folder of this machine, got '{cache}'"):
+        RenderStream(recipe, cache)
+
+
+def test_a_slice_of_samples_is_refused(pairs: StereoDataset) -> None:
+    with pytest.raises(TypeError, match=r"^index: must be one position; slice the pairs before"):
+        PairDataset(pairs)[0:2]
+    assert PairDataset(pairs[0:2])[-1]["frame_index"].item() == 1
 
 
 def test_a_loader_with_processes_gives_every_pair_once(pairs: StereoDataset) -> None:
@@ -228,18 +236,45 @@ def test_an_interrupted_training_goes_on_with_the_same_batches(
 ) -> None:
     context = forks if workers else None
 
-    def batches(done: int) -> list[list[int]]:
+    def batches(done: int, most: int | None = None) -> list[list[int]]:
         stream = RenderStream(recipe, tmp_path / "cache", replays=1)
         stream.start_at(epoch=2, batches_done=done, batch_size=3)
         loader: DataLoader[Any] = DataLoader(stream, batch_size=3, num_workers=workers, multiprocessing_context=context)
-        return [batch["frame_index"].tolist() for batch in loader]
+        return [batch["frame_index"].tolist() for batch in itertools.islice(loader, most)]
 
     whole = batches(0)
     assert len(whole) == 8
-    # The first batch of the rest comes from the first process again, whichever was next.
-    assert sorted(batches(4)) == sorted(whole[4:])
-    if workers == 0:
-        assert batches(3) == whole[3:]
+    # Two stops, at numbers that two processes do not divide.
+    assert batches(3, 2) == whole[3:5]
+    assert batches(5) == whole[5:]
+
+
+@pytest.mark.parametrize(("workers", "batch_size"), [(3, 2), (5, 3)])
+def test_a_training_goes_on_at_every_batch_with_the_next_one(
+    workers: int, batch_size: int, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of twelve frames, two of five processes have three and the others two: they end earlier."""
+    stream = RenderStream(recipe, tmp_path / "cache", replays=3)
+    monkeypatch.setattr("droguekit.torch.FrameTask", lambda *_, **__: lambda index: None)
+    monkeypatch.setattr("droguekit.torch.stored_pair", lambda _, index: index)
+    monkeypatch.setattr("droguekit.torch.sample_of_pair", lambda index, **_: index)
+
+    def batches(done: int) -> list[list[int]]:
+        """As torch's data loader takes them: from its processes in turn, but those at their end."""
+        stream.start_at(epoch=0, batches_done=done, batch_size=batch_size)
+        of_process = []
+        for worker in range(workers):
+            info = SimpleNamespace(id=worker, num_workers=workers)
+            monkeypatch.setattr("droguekit.torch.get_worker_info", lambda info=info: info)
+            frames = list(stream)
+            of_process.append([frames[place : place + batch_size] for place in range(0, len(frames), batch_size)])
+        turns = itertools.zip_longest(*of_process)
+        return [batch for turn in turns for batch in turn if batch is not None]
+
+    whole = batches(0)
+    assert sum(map(len, whole)) == 48
+    for done in range(len(whole) + 1):
+        assert batches(done) == whole[done:]
 
 
 def test_a_cache_is_a_dataset_that_rendering_completes(recipe: Recipe, tmp_path: Path) -> None:
