@@ -35,8 +35,10 @@ class PinholeCamera:
             raise ValueError(
                 f"width_px, height_px: must be positive whole numbers, got {self.width_px!r} and {self.height_px!r}"
             )
-        if not (np.isfinite([self.fx_px, self.fy_px, self.cx_px, self.cy_px]).all() and self.fx_px > 0 < self.fy_px):
+        if not (0 < self.fx_px < np.inf and 0 < self.fy_px < np.inf):
             raise ValueError(f"fx_px, fy_px: must be positive and finite, got {self.fx_px}, {self.fy_px}")
+        if not np.isfinite([self.cx_px, self.cy_px]).all():
+            raise ValueError(f"cx_px, cy_px: must be finite, got {self.cx_px}, {self.cy_px}")
 
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix. [px]"""

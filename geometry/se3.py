@@ -67,6 +67,10 @@ class RigidTransform:
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation_m", read_only(self.translation_m, (3,), "translation_m"))
 
+    def __reduce__(self) -> tuple[type[RigidTransform], tuple[Array, Array]]:
+        """Arrays would be writeable in a copy."""
+        return type(self), (self.rotation, self.translation_m)
+
     @staticmethod
     def identity() -> RigidTransform:
         """The identity transform."""

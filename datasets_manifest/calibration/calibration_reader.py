@@ -30,6 +30,7 @@ from datasets_manifest.calibration.stereo_calibration import (
     distortion_of_coefficients,
     finite_matrix,
     image_size,
+    is_ideal_pinhole,
     nearest_rotation,
     numbers,
     rig_of_cameras,
@@ -131,7 +132,7 @@ def _lens(table: Mapping[str, Any], name: str) -> Lens:
     given = table.get("distortion_coeffs", table.get("distortion_coefficients"))
     coefficients = numbers([] if given is None else given, f"{name}: distortion coefficients")
     model = str(table["distortion_model"])
-    if table["camera_model"] != "pinhole" or (model not in _RADTAN and coefficients.any()):
+    if table["camera_model"] != "pinhole" or not (model in _RADTAN or is_ideal_pinhole(model, coefficients)):
         raise ValueError(
             f"{name}: lens model {table['camera_model']}-{model} is not read; calibrate with pinhole-radtan"
         )

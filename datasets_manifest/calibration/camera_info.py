@@ -11,6 +11,7 @@ from datasets_manifest.calibration.stereo_calibration import (
     camera_of_matrix,
     distortion_of_coefficients,
     image_size,
+    is_ideal_pinhole,
     nearest_rotation,
     numbers,
     rig_of_rectification,
@@ -114,10 +115,10 @@ def _lens(info: CameraInfo) -> Lens:
     matrix, coefficients = numbers(info.K, info.place("K")), numbers(info.D, info.place("D"))
     if not matrix.any():
         raise ValueError(f"{info.place('K')}: is 0: the camera is not calibrated")
-    if info.distortion_model not in _MODELS and coefficients.any():
+    if info.distortion_model not in _MODELS and not is_ideal_pinhole(info.distortion_model, coefficients):
         raise ValueError(
             f"{info.name}: distortion model {info.distortion_model!r} is not read; calibrate with plumb_bob or "
-            "rational_polynomial"
+            "rational_polynomial, or leave the name empty where the images are rectified"
         )
     return calibrated_lens(
         camera_of_matrix(matrix, info.size_px, info.place("K")),

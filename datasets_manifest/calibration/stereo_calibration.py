@@ -26,6 +26,8 @@ _SKEW_PX = 1e-9
 # Numbers of coefficients of OpenCV's lens models; the first five are Brown-Conrady's.
 _COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 _BROWN_CONRADY_COUNT = 5
+# Lower-case names of models, and of none, whose image without distortion is that of a pinhole; a fisheye's is not.
+_PINHOLES = ("", "none", "pinhole", "radtan", "radial-tangential", "plumb_bob", "rational_polynomial")
 # Six printed decimals move the entries of a rotation by 5e-7, five by 5e-6; a typing error moves them by more.
 _ROTATION_TOLERANCE = 1e-4
 _EXACT = 1e-12
@@ -94,6 +96,11 @@ def nearest_rotation(matrix: object, name: str) -> Array:
     if not error <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError(f"{name}: is not a rotation matrix, got {m.tolist()}")
     return m if error < _EXACT else rotation
+
+
+def is_ideal_pinhole(model: str, coefficients: Array) -> bool:
+    """Whether a lens model with these coefficients has no distortion, whatever they mean in it."""
+    return model.lower() in _PINHOLES and not coefficients.any()
 
 
 def distortion_of_coefficients(coefficients: object, name: str) -> BrownConrady:

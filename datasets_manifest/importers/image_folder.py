@@ -80,7 +80,8 @@ def find_pairs(
         tolerance_ns: by how much the time stamps in the names of a pair may differ. [ns]
 
     Raises:
-        ValueError: no such folder, no pairs in it, or several ways to pair its files.
+        ValueError: no such folder, no pairs in it, several ways to pair its files, or a tolerance where there are no
+            stamps of two images.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: there is no such folder of images")
@@ -97,6 +98,8 @@ def find_pairs(
     if not any(found):
         if views is not None or not others:
             raise ValueError(f"{where}: holds no images ({', '.join(IMAGE_SUFFIXES)}), nor left/ and right/ with them")
+        if tolerance_ns:
+            raise ValueError(f"{where}: --stamp-tolerance-ms pairs two images, and each of these holds both views")
         return _with_times([(path, path) for path in others], {path: _stem(path) for path in others}, rate_hz)
     for eye, view in zip(EYES, found, strict=True):
         if not view:
@@ -332,6 +335,9 @@ def _listed_times(folder: Path, names: list[str]) -> tuple[list[int] | None, str
             while lines and not lines[-1].strip():
                 lines.pop()
             times_ns = [_line_time(line.strip()) for line in lines]
+            other = next((name for name in names if not name.isdecimal()), None)
+            if other is not None:
+                raise ValueError(f"{other!r} has no such number")
             return [times_ns[int(name)] for name in names], str(path)
         except (OSError, ValueError, IndexError, OverflowError) as error:
             raise ValueError(

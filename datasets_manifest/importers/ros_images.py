@@ -58,7 +58,12 @@ def decode_image(message: Any, name: str) -> RosImage:
         raise ValueError(f"{name}: encoding {encoding!r} is not read; use rgb8, bgr8, mono8, bayer_rggb8 or the like")
     kind, dtype = found[1], np.dtype(f"{'>' if message.is_bigendian else '<'}u{int(found[2]) // 8}")
     row_bytes = message.width * channels * dtype.itemsize
-    if not row_bytes or message.step < row_bytes or len(message.data) != message.step * message.height:
+    if (
+        not row_bytes
+        or not message.height
+        or message.step < row_bytes
+        or len(message.data) != message.step * message.height
+    ):
         raise ValueError(f"{name}: {len(message.data)} bytes are not an image of {message.width}x{message.height}")
     rows = np.asarray(message.data).reshape(message.height, message.step)[:, :row_bytes]
     values = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))

@@ -45,11 +45,21 @@ def test_image_ends_half_a_pixel_outside_the_outer_centres() -> None:
     assert CAMERA.contains(corners, margin_px=6.0).tolist() == [False] * 5
 
 
-@pytest.mark.parametrize("changes", [{"width_px": 0}, {"fx_px": 0.0}, {"fy_px": -1.0}, {"cx_px": float("nan")}])
-def test_impossible_cameras_are_refused(changes: dict[str, float]) -> None:
-    values = {"width_px": 64, "height_px": 48, "fx_px": 100.0, "fy_px": 100.0, "cx_px": 31.5, "cy_px": 23.5}
-    with pytest.raises(ValueError, match="must be positive"):
-        PinholeCamera(**{**values, **changes})
+@pytest.mark.parametrize(
+    ("name", "value", "fault"),
+    [
+        ("width_px", 0, "width_px, height_px: must be positive whole numbers"),
+        ("fx_px", 0.0, "fx_px, fy_px: must be positive and finite"),
+        ("fy_px", -1.0, "fx_px, fy_px: must be positive and finite"),
+        ("fx_px", float("nan"), "fx_px, fy_px: must be positive and finite"),
+        ("fy_px", float("inf"), "fx_px, fy_px: must be positive and finite"),
+        ("cx_px", float("nan"), "cx_px, cy_px: must be finite, got nan, 470.25"),
+        ("cy_px", float("inf"), "cx_px, cy_px: must be finite, got 639.5, inf"),
+    ],
+)
+def test_impossible_cameras_are_refused(name: str, value: float, fault: str) -> None:
+    with pytest.raises(ValueError, match=fault):
+        replace(CAMERA, **{name: value})
 
 
 @pytest.mark.parametrize("size", [float("nan"), 1280.5, 1280.0, True, "1280"])

@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from numpy.random import Generator
@@ -42,6 +46,14 @@ def test_identity_is_neutral() -> None:
     for a in transforms():
         assert_same(a @ RigidTransform.identity(), a, 0)
         assert_same(RigidTransform.identity() @ a, a, 0)
+
+
+@pytest.mark.parametrize("copy", [deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_copies_are_as_frozen_as_their_originals(copy: Callable[[RigidTransform], RigidTransform]) -> None:
+    for a in transforms():
+        again = copy(a)
+        assert_same(again, a, 0)
+        assert not again.rotation.flags.writeable and not again.translation_m.flags.writeable
 
 
 def test_inverse_undoes_from_both_sides() -> None:

@@ -185,6 +185,11 @@ def test_a_camera_chain_of_kalibr(tmp_path: Path) -> None:
     ("change", "fault"),
     [
         ({"distortion_model": "equidistant"}, "cam1: lens model pinhole-equidistant is not read"),
+        (
+            {"distortion_model": "equidistant", "distortion_coeffs": [0.0] * 4},
+            "cam1: lens model pinhole-equidistant is not read",
+        ),
+        ({"distortion_model": "fov", "distortion_coeffs": []}, "cam1: lens model pinhole-fov is not read"),
         ({"camera_model": "omni"}, "cam1: lens model omni-radtan is not read"),
         ({"distortion_coeffs": [0.1]}, "cam1: distortion coefficients: must be k1, k2, p1, p2"),
         ({"T_cn_cnm1": None}, "cam1: T_cn_cnm1: must"),

@@ -72,7 +72,7 @@ def test_printed_decimals_are_enough(decimals: int) -> None:
 def test_rectified_images_need_no_lenses() -> None:
     left, right = pair()
     infos = [replace(info, D=np.zeros(5), R=np.eye(3), K=info.P[:, :3]) for info in (left, right)]
-    for models in (("plumb_bob", "plumb_bob"), ("rational_polynomial", ""), ("equidistant", "none")):
+    for models in (("plumb_bob", "plumb_bob"), ("rational_polynomial", ""), ("pinhole", "None")):
         rig = rig_of_camera_info(*(replace(i, distortion_model=m) for i, m in zip(infos, models, strict=True)))
         assert rig.lenses is None
         np.testing.assert_array_equal(rig.camera.matrix(), left.P[:, :3])
@@ -100,6 +100,9 @@ def test_zeros_beyond_the_fifth_coefficient_are_no_other_model() -> None:
         ({}, {"K": M2.T}, "right.yaml: K: is transposed"),
         ({}, {"R": np.zeros((3, 3))}, "right.yaml: R: is not a rotation"),
         ({}, {"distortion_model": "equidistant"}, "right.yaml: distortion model 'equidistant' is not read"),
+        # Without coefficients too, a fisheye's radius is f theta, and not that of a pinhole.
+        ({}, {"distortion_model": "equidistant", "D": np.zeros(4)}, "right.yaml: distortion model 'equidistant' is"),
+        ({}, {"distortion_model": "kannala_brandt", "D": ()}, "right.yaml: distortion model 'kannala_brandt' is not"),
         ({}, {"size_px": (640, 480)}, r"right.yaml: its images have \(640, 480\) px"),
         ({}, {"P": np.zeros((3, 4))}, "right.yaml: P: must be fx 0 cx tx"),
         ({}, {"P": np.hstack([M1, np.zeros((3, 1))])}, "right.yaml: P: entry .0, 3. must be -fx times the baseline"),

@@ -173,6 +173,8 @@ def test_time_stamps_of_a_pair_may_differ_within_the_tolerance(tmp_path: Path) -
         find_pairs(tmp_path, tolerance_ns=60_000_000)
     with pytest.raises(ValueError, match="needs a time stamp in the name of every image"):
         find_pairs(touch(tmp_path / "plain", "left/1.png", "right/1.png"), tolerance_ns=1)
+    with pytest.raises(ValueError, match="--stamp-tolerance-ms pairs two images, and each of these holds both views"):
+        find_pairs(touch(tmp_path / "both", *(f"{ns}.png" for ns in STAMPS)), tolerance_ns=1)
 
 
 def test_lists_of_times_are_read(tmp_path: Path) -> None:
@@ -190,6 +192,15 @@ def test_lists_of_times_are_read(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"times\.txt: must list a time a line"):
             find_pairs(odometry)
     assert find_pairs(odometry, rate_hz=10.0).times_s == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("name", ["-1", "1_0", "+1", "first"])
+def test_only_numbers_are_places_in_a_list_of_times(name: str, tmp_path: Path) -> None:
+    folder = touch(tmp_path, f"left/{name}.png", f"right/{name}.png")
+    (folder / "times.txt").write_text("".join(f"{line}.0\n" for line in range(20)))
+    with pytest.raises(ValueError, match=r"times\.txt: must list a time a line .*: '.+' has no such number"):
+        find_pairs(folder)
+    assert find_pairs(folder, rate_hz=10.0).times_s == [0.0]
 
 
 @pytest.mark.parametrize("rate_hz", [None, 10.0])

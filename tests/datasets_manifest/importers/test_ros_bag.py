@@ -315,3 +315,11 @@ def test_names_of_encodings(encoding: str, is_read: bool) -> None:
     else:
         with pytest.raises(ValueError, match=f"a: encoding '{encoding}' is not read; use rgb8"):
             decode_image(message, "a")
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "bayer_rggb8"])
+@pytest.mark.parametrize(("height", "width"), [(0, WIDTH), (HEIGHT, 0)])
+def test_an_image_without_pixels_is_refused(encoding: str, height: int, width: int) -> None:
+    message = HUMBLE.types[IMAGE](header(HUMBLE, 1), height, width, encoding, 0, width, np.zeros(0, np.uint8))
+    with pytest.raises(ValueError, match=f"a: 0 bytes are not an image of {width}x{height}"):
+        decode_image(message, "a")
