@@ -14,6 +14,7 @@ from PIL import Image
 from datasets_manifest.atomic import part_path
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.report.label_drawing import Picture, resized
+from droguekit.scoring.report.number_text import plain_number
 
 _SUFFIXES = (".gif", ".mp4")
 _MOST_PICTURES = 2000
@@ -84,7 +85,8 @@ class WrittenVideo(NamedTuple):
     @property
     def pace_text(self) -> str:
         """The pace in words; empty where it is that of the flight."""
-        return "" if self.pace == 1 else f", {self.pace:.2g} times as fast as it flew"
+        pace = plain_number(float(f"{self.pace:.2g}"))
+        return "" if pace == "1" else f", {pace} times as fast as it flew"
 
 
 def write_pairs(path: Path, pictures: Iterable[Picture], records: Sequence[PairRecord]) -> WrittenVideo:

@@ -216,7 +216,7 @@ def _size_px(size: str) -> tuple[int, int]:
 
 
 def _geometry_text(choices: FileChoices) -> str:
-    width_px, height_px = _size_px(choices.size or _USUAL_SIZE)
+    width_px, height_px = _size_px(_USUAL_SIZE if choices.size is None else choices.size)
     return _GEOMETRY.format(width=width_px, height=height_px, focal=choices.focal_px, baseline=choices.baseline_m)
 
 

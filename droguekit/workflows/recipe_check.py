@@ -368,21 +368,25 @@ def _advice_in(recipe: Recipe, light: LightPrediction, rows: list[MarkerPredicti
     name = "lamps" if lit else "markers"
     when = {"day": "by day", "dusk": "at dusk", "night": "at night"}.get(light.light, "in this light")
 
-    def enough(faintest: MarkerPrediction) -> str:
-        least_cd_m2 = _least_luminance(recipe, scene, recipe.rig.delivered_focal_px / faintest.distance_m)
-        return "" if least_cd_m2 is None else f"{'' if lit else 'lamps of '}{_text(_rounded(least_cd_m2))} cd/m2"
+    def enough(failing: list[MarkerPrediction]) -> str:
+        """What suffices at all these distances: near markers ask for less light, or clip earlier."""
+        least_cd_m2 = [
+            _least_luminance(recipe, scene, recipe.rig.delivered_focal_px / row.distance_m) for row in failing
+        ]
+        known = [each for each in least_cd_m2 if each is not None]
+        return f"{'' if lit else 'lamps of '}{_text(_rounded(max(known)))} cd/m2" if len(known) == len(failing) else ""
 
     dark = [row for row in rows if row.contrast <= 0]
     if dark:
         infrared = "infrared lamps and a filter (rig preset mono-850)" if recipe.sensor.band_nm is None else ""
-        uses = [use for use in (enough(min(dark, key=lambda row: row.contrast)), infrared) if use]
+        uses = [use for use in (enough(dark), infrared) if use]
         yield (
             f"{name} are darker than what is beside them {when} from {dark[0].distance_m:.3g} m on: use "
             f"{' or '.join(uses) or 'brighter lamps'}"
         )
     faint = [row for row in rows if row.contrast > 0 and row.snr < LEAST_SNR]
     if faint:
-        uses = [use for use in (enough(min(faint, key=lambda row: row.snr)), "a wider aperture") if use]
+        uses = [use for use in (enough(faint), "a wider aperture") if use]
         yield (
             f"{name} are below {LEAST_SNR:g} deviations of the noise {when} from {faint[0].distance_m:.3g} m on: use "
             f"{', '.join(uses)} or a longer exposure"

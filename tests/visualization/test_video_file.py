@@ -38,6 +38,12 @@ def test_pairs_that_are_far_apart_are_shown_faster_and_it_is_said(tmp_path: Path
     assert video.length_s == 6.0 and video.pace_text == ", 4.5 times as fast as it flew"
 
 
+@pytest.mark.parametrize(("pace", "text"), [(1.02, ""), (1.5, "1.5"), (123.0, "120"), (2400.0, "2400")])
+def test_a_pace_is_told_in_two_figures(pace: float, text: str) -> None:
+    told = WrittenVideo(pairs=2, length_s=4.0, pace=pace).pace_text
+    assert told == (text and f", {text} times as fast as it flew")
+
+
 def test_the_step_from_one_sequence_to_the_next_does_not_count(tmp_path: Path) -> None:
     """Every sequence has a clock of its own, which starts again."""
     assert written(tmp_path, [0.0, 0.5], [0.0, 0.5], [30.0, 30.5]) == WrittenVideo(pairs=6, length_s=3.0, pace=1.0)

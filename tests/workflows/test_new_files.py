@@ -54,6 +54,7 @@ def test_a_new_rig_is_the_preset(preset: str, tmp_path: Path) -> None:
         (["drogue", "--markers", "40"], "marker_count: must be a whole number from 3 to 32, got 40"),
         (["drogue", "--marker-radius", "0.1"], "new drogue:"),
         (["rig", "--size", "1920"], "--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got '1920'"),
+        (["rig", "--size", ""], "--size: must be WIDTHxHEIGHT in pixels, such as 1920x1200, got ''"),
         (["rig", "--preset", "acme"], "no rig named 'acme'; there are rgb-ideal"),
         (["rig", "--bits", "10"], "output_bits"),
         (["recipe", "--distance", "far"], "--distance: must be NEAR:FAR in metres, such as 5:60, got 'far'"),

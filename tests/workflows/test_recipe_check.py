@@ -120,6 +120,17 @@ def test_what_will_fail_is_told_with_what_to_change(tmp_path: Path, changes: dic
     assert re.search(message, advice), advice
 
 
+def test_the_lamps_that_it_advises_are_enough(tmp_path: Path) -> None:
+    advice = "\n".join(checked(written(tmp_path, luminance=0.0, paint=0.02)).advice)
+    told = re.search(r"by day from 6 m on: use lamps of ([\d,]+) cd/m2", advice)
+    assert told, advice
+    luminance_cd_m2 = float(told[1].replace(",", ""))
+    enough = "\n".join(checked(written(tmp_path, luminance=luminance_cd_m2, paint=0.02)).advice)
+    assert "by day" not in enough
+    less = "\n".join(checked(written(tmp_path, luminance=luminance_cd_m2 / 2, paint=0.02)).advice)
+    assert "by day" in less
+
+
 def test_markers_darker_than_the_sky_but_brighter_than_the_face_do_not_fail(tmp_path: Path) -> None:
     """Painted markers of the common kind: the sky behind the drogue is brighter, and fits still find them by day."""
     check = checked(written(tmp_path, luminance=0.0, radius=0.019, high=20.0))
