@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections import deque
 from collections.abc import Callable
 
 from drogue_models.parameters import BodyMesh
 from drogue_models.untrusted_files import read_regular
 
-# Readers of the files that open datasets hold, by hash: what a hash names is the same wherever it is read.
-_stored_meshes: dict[str, Callable[[], bytes]] = {}
+# Readers of the files that open datasets hold, by hash: what a hash names is the same wherever it is read. Of several
+# copies the last opened is tried first, and one that is gone or damaged hides no other.
+_stored_meshes: dict[str, deque[Callable[[], bytes]]] = {}
+_MOST_COPIES = 16
 
 
 def offer_body_mesh(sha256: str, read: Callable[[], bytes]) -> None:
@@ -19,7 +22,7 @@ def offer_body_mesh(sha256: str, read: Callable[[], bytes]) -> None:
         sha256: of the file.
         read: its contents; raises OSError where the copy is gone.
     """
-    _stored_meshes[sha256] = read
+    _stored_meshes.setdefault(sha256, deque(maxlen=_MOST_COPIES)).appendleft(read)
 
 
 def body_mesh_data(body: BodyMesh) -> bytes:
@@ -28,12 +31,11 @@ def body_mesh_data(body: BodyMesh) -> bytes:
     Raises:
         ValueError: there is neither, or the file has another hash than when the drogue was loaded.
     """
-    stored = _stored_meshes.get(body.sha256)
-    if stored is not None:
+    for read in _stored_meshes.get(body.sha256, ()):
         try:
-            data = stored()
+            data = read()
         except OSError:
-            data = b""
+            continue
         if hashlib.sha256(data).hexdigest() == body.sha256:
             return data
     try:

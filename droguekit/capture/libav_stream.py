@@ -312,14 +312,20 @@ def libav_place(
 
 
 def without_secrets(address: str) -> str:
-    """An address as it may be printed: without user, password and query."""
+    """An address as it may be printed: without user, password and query, also where some cameras put it in the path."""
     if "://" not in address:
         return address
+    nothing = f"{address.partition('://')[0]}://..."
     try:
         parts = urlsplit(address)
         _ = parts.port
     except ValueError:
         # Letters where the port should be are the rest of a password, which has a / or the like in it.
-        return f"{address.partition('://')[0]}://..."
+        return nothing
+    _, at, place = parts.netloc.rpartition("@")
+    if not at and ":" in place and "@" in address:
+        # What looks like a port may be the beginning of such a password.
+        return nothing
+    path = "/".join("..." if "=" in name else name for name in parts.path.split("/"))
     query = "?..." if parts.query or parts.fragment else ""
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}{query}"
+    return f"{parts.scheme}://{place}{path}{query}"

@@ -379,6 +379,8 @@ class StampPairing:
         nearest = self._nearest()
         assert nearest is not None
         difference_s = _difference_s(nearest)
+        if difference_s <= self._tolerance_s and self._period_s() == 0:
+            return "; a pair of unequal time stamps waits for the next image, which tells the period"
         remedy = ", or allow the difference by --stamp-tolerance-ms" if difference_s > self._tolerance_s else ""
         return (
             f"; the time stamps of left and right differ by {1e3 * difference_s:.3g} ms or more: trigger both cameras "

@@ -155,7 +155,11 @@ def test_the_table_of_poses_holds_those_of_the_lines(tmp_path: Path, monkeypatch
     record = Path("data/flight7/frames/000001/record.json")
     record.parent.mkdir(parents=True)
     record.write_text('{"time_s": 0.04}')
-    exec(compile(example, "compare-poses.md", "exec", dont_inherit=True), {})
+    names: dict[str, Any] = {}
+    exec(compile(example, "compare-poses.md", "exec", dont_inherit=True), names)
+    write_estimates(Path("plain.jsonl"), (stamped.model_copy(update={"covariance": None}),))
+    names["write_table"]("plain.jsonl", "plain.csv", "joint-hub")
+    assert Path("plain.csv").read_text().splitlines()[1].startswith("12.25,0.06,-0.1,5.0,")
     table = np.genfromtxt("poses.csv", delimiter=",", names=True)
     assert table["time_s"].tolist() == [0.04, 12.25]
     for row in table:

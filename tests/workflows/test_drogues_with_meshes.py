@@ -13,6 +13,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.layout import MESHES_FOLDER, RECIPE_FILE
+from datasets_manifest.storage.reader import Dataset
 from drogue_models.drogue_families import mesh_files
 from drogue_models.drogue_families.body_symmetry import body_symmetry_order
 from drogue_models.parts import Part
@@ -86,3 +87,12 @@ def test_changed_and_missing_copies_of_a_mesh_are_faults(lonely_dataset: Path) -
     assert any("was changed: its hash differs" in fault for fault in validate_dataset(lonely_dataset).faults)
     copy.unlink()
     assert any(f"{copy.name}: is missing; `render`" in fault for fault in validate_dataset(lonely_dataset).faults)
+
+
+def test_a_copy_that_is_gone_hides_no_other(lonely_dataset: Path, tmp_path: Path) -> None:
+    other = tmp_path / "copied"
+    shutil.copytree(lonely_dataset, other)
+    drogue = Dataset(lonely_dataset).manifest.recipe.drogue
+    assert Dataset(other).manifest.recipe.drogue == drogue
+    shutil.rmtree(other)
+    assert drogue_hull_m(drogue).size
