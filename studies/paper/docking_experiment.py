@@ -26,6 +26,7 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from droguekit.scoring.confidence_intervals import Interval, mean_interval
 from droguekit.scoring.pose_benchmark import score_methods
 from droguekit.scoring.poses.drogue_truth import drogue_truth
+from droguekit.scoring.poses.method_scores import block_of_pair
 from droguekit.scoring.poses.pose_errors import pose_error
 from droguekit.scoring.report.label_drawing import Picture, display_picture, jpeg_uri
 from droguekit.scoring.report.number_text import plain_number, three_digits
@@ -93,9 +94,14 @@ class DockingData(ExperimentData):
             if isinstance(estimate, PoseEstimate) and index in self.records
         }
 
+    @property
+    def sequence_of_frame(self) -> dict[int, int | None]:
+        """The sequence of every pair that shows a drogue, None where it belongs to none."""
+        return {index: record.sequence_id for index, record in self.records.items()}
+
     def sequences(self) -> list[int | None]:
         """Ids of the sequences, ascending; only None where pairs belong to none."""
-        ids = {record.sequence_id for record in self.records.values()}
+        ids = set(self.sequence_of_frame.values())
         return sorted(ids, key=lambda number: (number is None, number or 0))
 
     def run(self, sequence_id: int | None) -> DockingRun:
@@ -156,22 +162,27 @@ def read_docking(dataset: Location, estimates: Path, faults: PairFaults | None =
     return DockingData(data, file, shown, first_frames, result)
 
 
-def subset_scores(errors: Mapping[int, Array], frames: Sequence[int]) -> SubsetScores:
+def subset_scores(
+    errors: Mapping[int, Array], frames: Sequence[int], sequences: Mapping[int, int | None]
+) -> SubsetScores:
     """Scores over some pairs, of which there is at least one.
 
     Args:
         errors: (5,) X, Y, Z [m], pitch, yaw [deg] by frame, where there is a pose.
         frames: which pairs count.
+        sequences: of every frame, None where it belongs to none; whole sequences are the independent samples.
     """
-    rows = np.array([errors[index] for index in frames if index in errors])
-    if not len(rows):
+    found = [index for index in frames if index in errors]
+    if not found:
         return SubsetScores(0.0)
+    rows = np.array([errors[index] for index in found])
+    blocks = [block_of_pair(index, sequences[index]) for index in found]
     lengths = np.linalg.norm(rows[:, :3], axis=1)
     sizes = np.abs(rows)
     return SubsetScores(
         fix_fraction=len(rows) / len(frames),
         mean_m=float(lengths.mean()),
-        interval_m=mean_interval(lengths, range(len(lengths)), (0.0, math.inf)),
+        interval_m=mean_interval(lengths, blocks, (0.0, math.inf)),
         p99_m=float(np.percentile(lengths, 99.0)),
         largest_m=sizes[:, :3].max(axis=0),
         angles_p99_deg=np.percentile(sizes[:, 3:], 99.0, axis=0),

@@ -189,7 +189,7 @@ def _docking_cells(contender: Contender, method: MethodResult) -> list[str]:
         contender.label,
         percent(row.fix_fraction),
         millimetres(row.position_mean_m),
-        # The bootstrap draws single pairs, as if they were independent.
+        # Without sequences, single pairs count as independent, and a filter's are not.
         ABSENT if contender.is_filtered else interval_text(row.intervals.get("position_mean_m"), 1e3),
         millimetres(row.position_p99_m),
         ", ".join(map(millimetres, (row.x_max_m, row.y_max_m, row.z_max_m))),
@@ -200,7 +200,7 @@ def _docking_cells(contender: Contender, method: MethodResult) -> list[str]:
 
 
 def _chosen_cells(docking: DockingData, contender: Contender, frames: Sequence[int]) -> list[str]:
-    scores = subset_scores(docking.pose_errors(contender.method), frames)
+    scores = subset_scores(docking.pose_errors(contender.method), frames, docking.sequence_of_frame)
     largest = [None] * 3 if scores.largest_m is None else scores.largest_m.tolist()
     angles = [None] * 2 if scores.angles_p99_deg is None else scores.angles_p99_deg.tolist()
     return [

@@ -44,7 +44,7 @@ def test_pairs_are_chosen_by_what_both_eyes_see(record: PairRecord) -> None:
 def test_scores_are_those_of_the_chosen_pairs() -> None:
     errors = {k: np.array([0.003 * (k + 1), 0.004 * (k + 1), 0.0, 0.1 * k, -0.2]) for k in range(4)}
     errors[9] = np.full(5, 100.0)
-    scores = subset_scores(errors, [0, 1, 2, 3, 7])
+    scores = subset_scores(errors, [0, 1, 2, 3, 7], dict.fromkeys(range(8)))
     # 3, 4, 5: the lengths are 5, 10, 15 and 20 mm; pair 7 has no pose and pair 9 does not count.
     assert scores.mean_m == pytest.approx(0.0125)
     assert scores.fix_fraction == pytest.approx(0.8)
@@ -56,6 +56,16 @@ def test_scores_are_those_of_the_chosen_pairs() -> None:
     assert scores.angles_p99_deg[1] == pytest.approx(0.2)
 
 
+def test_pairs_of_a_flight_count_as_one_for_the_interval() -> None:
+    lengths_m = [0.001, 0.001, 0.003, 0.003, 0.003]
+    errors = {k: np.array([length, 0, 0, 0, 0]) for k, length in enumerate(lengths_m)}
+    flights = {0: 1, 1: 1, 2: 2, 3: 2, 4: 2}
+    scores = subset_scores(errors, range(5), flights)
+    # Of two flights Student's factor is 12.7: nothing is known but that the length is not negative.
+    assert scores.interval_m is not None and scores.interval_m[0] == 0.0 and scores.interval_m[1] > 0.01
+    assert subset_scores(errors, [2, 3, 4], flights).interval_m is None
+
+
 def test_without_a_pose_there_is_nothing_to_tell() -> None:
-    scores = subset_scores({}, [1, 2])
+    scores = subset_scores({}, [1, 2], {1: None, 2: None})
     assert (scores.fix_fraction, scores.mean_m, scores.largest_m) == (0.0, None, None)
