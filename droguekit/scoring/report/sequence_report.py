@@ -53,7 +53,7 @@ _TRACKING_NOTES = [
     "box's width and height.",
     "A loss begins when the box is missing, or overlaps the true one by less than 0.1, after an image in which the "
     "drogue was followed. Both eyes mostly lose it together, so the row of both is that of the eye with more losses. "
-    "The interval of the rate is that of a Poisson law; the others come from resampled sequences, and need two.",
+    "The interval of the rate is that of a Poisson law; the others are Student's over sequences, and need two.",
     "After the drogue was hidden, or lost beside the sun, a box finds it again when it overlaps the true one by half. "
     "The delay counts from the first image that shows half of it, which is 0.",
 ]
@@ -220,7 +220,8 @@ def _filter_part(
         "Lag is the shift in time that makes estimates agree best with such a curve, apart from a constant error of "
         "each sequence. Where the drogue hardly moves along an axis, it is not known well.",
         "Errors of neighbouring pairs are alike, so means of true covariances scatter more than the range of "
-        "independent ones; the interval from resampled sequences allows for that.",
+        "independent ones; the interval, Student's over sequences, allows for that. Intervals of lags and of ratios "
+        "come from resampled sequences.",
     ]
     return ReportPart(
         "filter", "Motion and filter", _legend(filters, styles), _drawn(panels), filter_tables(filters), notes

@@ -67,7 +67,7 @@ class DockingRow(ResultModel):
     Attributes:
         n, of: pairs with docking quantities, of those whose true ones are known.
         mouth_rmse_m, mouth_bias_m: of the place of the mouth. [m]
-        mouth_rms_m: of the length of that error; `mouth_interval` by resampled sequences. [m]
+        mouth_rms_m: of the length of that error; `mouth_interval` is Student's over sequences. [m]
         calibration: of each axis.
         closure_n, closure_rmse_m_s, closure_bias_m_s: of the closure where it is known; null without any. [m/s]
         contact_median_absolute_s: size of the error of the time until the rim; null without any. [s]
@@ -113,7 +113,7 @@ class OverlapRow(ResultModel):
 
     Attributes:
         n: images.
-        auc: area under the success plot: mean of `success`; `auc_interval` by resampled sequences.
+        auc: area under the success plot: mean of `success`; `auc_interval` is Student's over sequences.
         mean_overlap: mean intersection over union.
         precision: share of centres within 20 px of the true one; `precision_interval` as above.
         normalized_precision: mean of `normalized`.
@@ -255,7 +255,7 @@ class MotionRow(ResultModel):
     Attributes:
         n, of: pairs with a motion, of those whose true one is known.
         velocity_rmse_m_s, rate_rmse_deg_s: by axis of the left camera. [m/s, deg/s]
-        speed_rmse_m_s, turn_rmse_deg_s: of the lengths of both errors; `*_interval` by resampled sequences.
+        speed_rmse_m_s, turn_rmse_deg_s: of the lengths of both errors; `*_interval` is Student's over sequences.
     """
 
     n: int
@@ -281,7 +281,7 @@ class MotionNees(ResultModel):
     Attributes:
         n, unusable: covariances that count, and that are not positive definite.
         velocity, rate: of three components each.
-        motion: of all six; `interval` of its mean by resampled sequences.
+        motion: of all six; `interval` of its mean is Student's over sequences.
     """
 
     n: int
