@@ -112,17 +112,23 @@ def test_intervals_of_sequences_with_offsets_cover(lengths: tuple[int, ...], rng
     assert alone / TRIALS < 0.45
 
 
-def test_a_single_block_has_no_interval_of_mean_and_percentile(rng: np.random.Generator) -> None:
+def test_a_single_block_has_no_interval_of_its_mean(rng: np.random.Generator) -> None:
     values = rng.normal(1, 2, (5, 1))
     assert mean_interval(values[:1, 0], [0]) is None
     assert mean_interval(values[:, 0], [3] * 5) is None
-    assert percentile_intervals(values[:1], (95.0,), [0], "one") is None
-    assert percentile_intervals(values, (95.0,), [3] * 5, "one") is None
 
 
 def test_mean_interval_stays_within_its_limits() -> None:
     assert mean_interval(np.array([1.0, 2.0]), [0, 1], (0.0, np.inf)) == (0.0, pytest.approx(1.5 + 12.7062 / 2))
     assert mean_interval(np.array([0.0, 1.0]), [0, 1], (0.0, 1.0)) == (0.0, 1.0)
+
+
+def test_too_few_blocks_have_no_interval_of_a_percentile(rng: np.random.Generator) -> None:
+    # All of five values lie on one side of their median in 2 / 2^5 = 6 %, which an interval of 95 % must not miss.
+    values = rng.normal(1, 2, (60, 1))
+    assert percentile_intervals(values[:5], (50.0,), range(5), "few") is None
+    assert percentile_intervals(values, (95.0,), (np.arange(60) % 5).tolist(), "few") is None
+    assert percentile_intervals(values[:6], (50.0,), range(6), "few") is not None
 
 
 def test_percentile_intervals_cover(rng: np.random.Generator) -> None:
@@ -137,10 +143,11 @@ def test_percentile_intervals_cover(rng: np.random.Generator) -> None:
 
 
 def test_percentiles_of_resamples_are_numpys(rng: np.random.Generator) -> None:
-    columns, blocks, percentiles = rng.normal(0, 1, (12, 2)), np.repeat([4, 1, 9], (3, 4, 5)), (50.0, 95.0)
+    names, percentiles = (1, 4, 9, 10, 11, 15), (50.0, 95.0)
+    columns, blocks = rng.normal(0, 1, (18, 2)), np.repeat([4, 1, 9, 15, 10, 11], (3, 4, 5, 1, 2, 3))
     ends = percentile_intervals(columns, percentiles, blocks.tolist(), "key")
-    members = [np.flatnonzero(blocks == block) for block in (1, 4, 9)]
-    drawn = named_generator("key").integers(0, 3, (RESAMPLES, 3))
+    members = [np.flatnonzero(blocks == block) for block in names]
+    drawn = named_generator("key").integers(0, 6, (RESAMPLES, 6))
     ranks = [
         np.percentile(np.abs(columns[np.concatenate([members[k] for k in draw])]), percentiles, axis=0)
         for draw in drawn
