@@ -82,10 +82,14 @@ def percentile_limit(values: ArrayLike, percent: float) -> ValueWithLimit:
 def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> ValueWithLimit:
     """Ratio of two positive means over the same frames, by Student's law of its logarithm to first order.
 
+    The ratio is NaN where a mean is zero, for then nothing is known of its logarithm.
+
     Args:
         above, below: sums over the same independent blocks of frames, two or more.
     """
     first, second = (np.asarray(values, dtype=np.float64) for values in (above, below))
+    if not (first.any() and second.any()):
+        return float("nan"), float("inf")
     ratio, blocks = float(first.sum() / second.sum()), len(first)
     shares = blocks * (first / first.sum() - second / second.sum())
     error = shares.std(ddof=1) / np.sqrt(blocks)
@@ -268,6 +272,7 @@ class AcceptanceTable(BaseModel):
 
 _WITHOUT_NUMBER = (GOAL, COMPARISON)
 _TOO_FEW = "too few values for a 95 % limit"
+_OF_ZEROS = "errors that are all zero have no ratio"
 TWO_SIDED = "ends of a two-sided 95 % interval"
 """Note of limits that are one-sided at 97.5 %, as the benchmark gives them."""
 _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met", "note"]
@@ -276,8 +281,13 @@ _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met",
 def at_most(
     bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = ""
 ) -> AcceptanceRow:
-    """A quantity that must not exceed `high`; `measured` is its value and upper limit, infinite with too few values."""
+    """A quantity that must not exceed `high`; `measured` is its value and upper limit, infinite with too few values.
+
+    A value of NaN is a ratio of errors of which some are all zero, and counts as not measured.
+    """
     value, limit = measured
+    if np.isnan(value):
+        return not_measured(bar, quantity, high, "; ".join(part for part in (_OF_ZEROS, note) if part))
     return AcceptanceRow(
         bar=bar,
         quantity=quantity,

@@ -172,7 +172,7 @@ def chain_rows(images: ImageScores, bar: float) -> list[AcceptanceRow]:
     ours, theirs = (between_m(images.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
     common = [i for i in ours if len(ours[i].markers.offset_px) and len(theirs[i].markers.offset_px)]
     if len(common) < 2:
-        return [_none("4", quantity, bar)]
+        return [_one_pair("4", quantity, bar) if common else _none("4", quantity, bar)]
     first, second = ([frames[i].markers.offset_px for i in common] for frames in (ours, theirs))
     if all(map(np.array_equal, first, second)):
         return [not_measured("4", quantity, bar, f"'{CHAIN}' was given the same centroids")]
@@ -210,7 +210,7 @@ def paper_rows(images: ImageScores) -> list[AcceptanceRow]:
     ours, theirs = (between_m(images.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
     common = [i for i in ours if ours[i].pose is not None and theirs[i].pose is not None]
     if len(common) < 2:
-        return [_none("15", quantity, bar)]
+        return [_one_pair("15", quantity, bar) if common else _none("15", quantity, bar)]
     above, below = (
         np.linalg.norm(pose_array({i: frames[i] for i in common})[:, :3], axis=1)[:, None] for frames in (ours, theirs)
     )
@@ -285,9 +285,11 @@ def _bias_rows(images: ImageScores) -> list[AcceptanceRow]:
 
 
 def _rms_row(bar: str, quantity: str, high: float, errors: Mapping[int, Array]) -> AcceptanceRow:
-    """Root mean square of the errors (K, 2) of each pair; pairs are the independent samples."""
+    """Root mean square of the errors (K, 2) of each pair; pairs are the independent samples, at least two of them."""
     if not any(len(each) for each in errors.values()):
         return _none(bar, quantity, high)
+    if sum(bool(len(each)) for each in errors.values()) < 2:
+        return _one_pair(bar, quantity, high)
     values = np.concatenate([each.ravel() for each in errors.values()])
     pairs = [index for index, each in errors.items() for _ in range(each.size)]
     return at_most(bar, quantity, high, block_rms_limit(values, pairs), values.size)
@@ -307,6 +309,10 @@ def _failures(frames: Frames) -> str:
 
 def _none(bar: str, quantity: str, high: float) -> AcceptanceRow:
     return not_measured(bar, quantity, high, "nothing was measured there")
+
+
+def _one_pair(bar: str, quantity: str, high: float) -> AcceptanceRow:
+    return not_measured(bar, quantity, high, "a single pair was measured, of which no limit is known")
 
 
 def normalized_error_rows(name: str, result: BenchmarkResult) -> list[AcceptanceRow]:

@@ -75,6 +75,12 @@ def test_the_limit_of_a_ratio_in_the_same_frames_covers_it_in_19_of_20_samples()
     assert np.mean(limits >= 2.0) == pytest.approx(0.95, abs=0.025)
 
 
+@pytest.mark.parametrize(("above", "below"), [([0, 0], [1, 2]), ([1, 2], [0, 0]), ([0, 0], [0, 0])])
+def test_errors_that_are_all_zero_have_no_ratio(above: list[float], below: list[float]) -> None:
+    row = at_most("4", "x", 1.0, acceptance_table.paired_ratio_limit(above, below), 2)
+    assert (row.measured, row.met, row.note) == (None, False, "errors that are all zero have no ratio")
+
+
 def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None:
     draws = rng(7)
     below = draws.normal(0, 1.0, (4000, 300))

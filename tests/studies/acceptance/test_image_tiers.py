@@ -99,7 +99,15 @@ def test_markers_of_a_pair_that_err_alike_widen_the_limits() -> None:
 
 def test_a_single_pair_shows_no_ratio_of_centroids() -> None:
     ours, theirs = ({0: f[8]} for f in (frames(0.012, 0.1, 1), frames(0.06, 2.0, 2)))
-    assert not image_tiers.chain_rows(light(**{BEST: ours, CHAIN: theirs}), 1 / 4)[0].met
+    row = image_tiers.chain_rows(light(**{BEST: ours, CHAIN: theirs}), 1 / 4)[0]
+    assert not row.met and row.note.startswith("a single pair was measured")
+
+
+def test_a_single_pair_meets_no_criterion_of_centroids() -> None:
+    single = light(**{BEST: {0: frames(1e-6, 0.1, 1)[8]}})
+    rows = [*image_tiers.centroid_bound_rows(single), *image_tiers.centroid_rows(single)]
+    assert not any(row.met for row in rows)
+    assert any(row.note.startswith("a single pair was measured") for row in rows)
 
 
 def test_a_stack_that_fails_on_most_pairs_is_not_passed() -> None:
