@@ -75,5 +75,5 @@ def read_results(file: Path, made_by: Mapping[str, Any], report: ProgressReport)
     known = {name: result for name, result in stored.items() if result.pop(_MADE_BY, None) == made_by}
     if len(known) < len(stored):
         others = f"{len(stored) - len(known)} of {len(stored)} results"
-        report.say(f"{file}: {others} are of other options, code or machine, and are not used")
+        report.say(f"{file}: {others} are of other options, code or machine, and are replaced")
     return known

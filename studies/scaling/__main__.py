@@ -275,7 +275,7 @@ def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: P
         OSError: a process failed, or the folder cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    build = rendering_build(RENDER_COMMAND)
+    build = rendering_build((*RENDER_COMMAND, "studies.scaling"))
     known = read_results(out / RESULTS_FILE, build, report)
     recipe_text = UNIFORM_RECIPE.format(pairs=pairs)
     planned: dict[str, tuple[str, Callable[[], Mapping[str, Any]]]] = {

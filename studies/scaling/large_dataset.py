@@ -180,7 +180,7 @@ def measure(dataset: Path, records: int, only: Sequence[str], report: ProgressRe
         OSError: a command failed, or the folder cannot be written.
     """
     results = dataset.parent / RESULTS_FILE
-    build = rendering_build(RENDER_COMMAND)
+    build = rendering_build((*RENDER_COMMAND, "studies.scaling"))
     known = {key: CommandCost(**cost) for key, cost in read_results(results, build, report).items()}
     commands = _commands(dataset, dataset.parent / f"{records}-made")
     for name, arguments in commands.items():

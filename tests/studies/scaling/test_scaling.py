@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+import studies.scaling.__main__ as scaling
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
+from studies.scaling import large_dataset
 from studies.scaling.__main__ import RESULTS_FILE, dask_cost, measure, table
 from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes
 
@@ -34,6 +36,19 @@ def test_empty_frames_are_measured_once(tmp_path: Path) -> None:
     (tmp_path / RESULTS_FILE).write_text(json.dumps(known))
     again = measure(tmp_path, 2, 10, ("local",), told)
     assert "wall 12345.00 ms" in table(again)[0]
+
+
+def test_figures_of_other_code_of_the_study_are_not_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = PlainProgress(io.StringIO())
+    folder = tmp_path / "dataset"
+    for module, again in (
+        (scaling, lambda: measure(tmp_path, 2, 10, (), told)),
+        (large_dataset, lambda: large_dataset.measure(folder, 40, ["none"], told)),
+    ):
+        rooms: list[str] = []
+        monkeypatch.setattr(module, "rendering_build", rooms.extend)
+        assert not again()
+        assert "studies.scaling" in rooms
 
 
 @pytest.mark.slow  # starts a scheduler and a worker, which other tests do too
