@@ -307,7 +307,7 @@ class Corpus:
         caches: one for each dataset.
         places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
         without_drogue: photographs to train on beside the pairs, the same for both eyes, or None.
-        sources: the datasets themselves, for images as they were taken.
+        sources: the datasets themselves, for images as they were taken and for faults; may be left out.
     """
 
     datasets: tuple[DatasetStamp, ...]
@@ -320,7 +320,7 @@ class Corpus:
     @property
     def fault(self) -> str | None:
         """Damaged pairs so far, which are left out, as one line; None for nothing."""
-        lines = ((source.path, cache.faults.line()) for source, cache in zip(self.sources, self.caches, strict=True))
+        lines = ((source.path, cache.faults.line()) for source, cache in zip(self.sources, self.caches, strict=False))
         return next((f"{path}: {line}" for path, line in lines if line is not None), None)
 
     @property

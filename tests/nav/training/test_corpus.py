@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,7 @@ def test_a_damaged_pair_is_left_out_and_named_before_training(
     shutil.copytree(split_dataset / "frames" / frame.name, frame)
     corpus = open_small([dataset], tmp_path / "cache")
     assert corpus.fault is None
+    assert replace(corpus, sources=()).fault is None
     whole = open_small([split_dataset], tmp_path / "whole")
     assert len(corpus.places) == len(whole.places)
     np.testing.assert_array_equal(corpus.image(0, 1), whole.image(0, 1))
