@@ -22,7 +22,7 @@ BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
 REDETECT_EVERY = 25
 """The detector checks a tracker after this many pairs: once a second at the seed paper's 25 pairs a second."""
 MOST_UNCONFIRMED = 3 * REDETECT_EVERY
-"""After this many pairs without any detection, what is followed is given up: at the third check without a result.
+"""After this many pairs without any detection, what is followed is given up.
 
 A detector may overlook a drogue that is near or blurred, but a false detection would be followed for ever. To give up a
 drogue costs little: from then on the detector looks for it at every pair.
