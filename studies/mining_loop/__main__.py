@@ -89,12 +89,21 @@ def _weights_name(start: str) -> str:
 
 def _check_made_from(folder: Path, made_from: dict[str, object]) -> None:
     """Record in an empty folder what its training is made from, and refuse one that holds another training."""
-    file, text = folder / "made-from.json", json.dumps(made_from, indent=1) + "\n"
-    if file.is_file() and file.read_text(encoding="utf-8") == text:
+    file = folder / "made-from.json"
+    if not file.is_file():
+        if any(folder.iterdir()):
+            raise ValueError(
+                f"{folder}: holds a training without {file.name}, made from unknown data; give another --out"
+            )
+        write_text_atomic(file, json.dumps(made_from, indent=1) + "\n")
         return
-    if any(folder.iterdir()):
-        raise ValueError(f"{folder}: holds a training with other {', '.join(made_from)}; give another --out")
-    write_text_atomic(file, text)
+    try:
+        stored = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: is damaged: {error}; give another --out") from error
+    held = stored if isinstance(stored, dict) else {}
+    if other := [key for key, value in made_from.items() if key not in held or held[key] != value]:
+        raise ValueError(f"{folder}: holds a training with other {', '.join(other)}; give another --out")
 
 
 def detected(out: Path, detector: str, dataset: str) -> Path:

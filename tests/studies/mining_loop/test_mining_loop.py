@@ -105,9 +105,25 @@ def test_trainings_are_used_again_only_for_their_own_options(
     for changes in ({"image_passes": 2000}, {"further_passes": 960}):
         with pytest.raises(SystemExit):
             trainings_of(**changes)
-        assert "holds a training with other passes" in capsys.readouterr().err
+        assert "holds a training with other passes; give another --out" in capsys.readouterr().err
     assert trainings_of(start_from="mobile-s") == ["even-from-mobile-s-1", "mined-30-mobile-s-from-mobile-s-1"]
     assert trainings_of(start_from="mobile-s", kept=0.7) == ["mined-70-mobile-s-from-mobile-s-1"]
+
+
+@pytest.mark.parametrize(("content", "told"), [(None, "without made-from.json"), ("{", "made-from.json: is damaged")])
+def test_a_folder_that_does_not_say_what_made_it_is_named(
+    content: str | None,
+    told: str,
+    trainings_of: Callable[..., list[str]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    trainings_of()
+    file = tmp_path / "trainings" / "first-0" / "made-from.json"
+    file.unlink() if content is None else file.write_text(content)
+    with pytest.raises(SystemExit):
+        trainings_of()
+    assert told in capsys.readouterr().err
 
 
 def test_two_ways_to_train_on_are_refused(
