@@ -11,7 +11,7 @@ from drogue_models.bodies import BasketBody, ConeBody
 from drogue_models.drogue_families.user_meshes import load_body_mesh
 from drogue_models.parameters import DrogueParameters
 
-# Of a user's mesh; finer ones look round.
+# Tried on a user's mesh; one of more sections is told by the largest of their divisors below.
 _MOST_TURNS = 96
 _MESH_TOLERANCE_M = 1e-4
 

@@ -189,7 +189,7 @@ def hub_groove_m(drogue: DrogueParameters, hub: HubParameters) -> list[tuple[flo
 
 
 def hub_holder(drogue: DrogueParameters, hub: HubParameters) -> trimesh.Trimesh:
-    """A dark dish around the hub's annulus, whose bright walls would be seen beyond its edges."""
+    """A dish of the structure's colour around the hub's annulus, whose bright walls would be seen beyond its edges."""
     groove = hub_groove_m(drogue, hub)
     edge_m = groove[-1][0] + min(HOLDER_BORDER_M, drogue.coupling_radius_m - hub.outer_radius_m)
     back_m = HOLDER_PER_HUB_THICKNESS * hub_thickness_m(drogue)

@@ -21,6 +21,9 @@ _ARCHIVES = {"bz2", "gz", "tar.bz2", "tar.gz", "zip", "3mf", "3dxml", "zae"}
 _TOLERANCE_M = 1e-6
 # A surface in the plane of the hub's face would flicker with it.
 _BEHIND_HUB_M = 1e-4
+# A cube of a hundredth of a millimetre: rounding errors of a doubled sheet, which encloses nothing.
+_SMALLEST_PIECE_M3 = 1e-15
+# Of a piece's corners, that are looked up inside the others.
 _MOST_PLACES = 256
 
 
@@ -88,15 +91,19 @@ def _surface_fault(mesh: trimesh.Trimesh) -> str | None:
     if not mesh.is_winding_consistent:
         return "must have its normals outwards everywhere; recalculate them and export it again"
     piece_of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
-    # Six times the signed volume between each triangle and the origin.
-    volumes = np.bincount(piece_of_face, weights=np.linalg.det(mesh.triangles))
-    for piece in np.flatnonzero(volumes <= 0):
+    # Signed, between each triangle and the origin.
+    volumes_m3 = np.bincount(piece_of_face, weights=np.linalg.det(mesh.triangles) / 6)
+    for piece in np.flatnonzero(volumes_m3 < _SMALLEST_PIECE_M3):
         own = piece_of_face == piece
-        if volumes[piece] == 0 or not _is_inside(_places_on(mesh.triangles[own]), mesh.triangles[~own]):
+        is_flat = abs(volumes_m3[piece]) < _SMALLEST_PIECE_M3
+        if is_flat or not _is_inside(_places_on(mesh.triangles[own]), mesh.triangles[~own]):
             x, y, z = mesh.triangles[own].reshape(-1, 3).mean(axis=0)
+            where = f"the piece of {np.count_nonzero(own)} triangles around ({x:.3g}, {y:.3g}, {z:.3g}) m"
+            if is_flat:
+                return f"must enclose a volume, but {where} does not; remove it, or give it thickness"
             return (
-                f"must have its normals outwards everywhere, but the piece of {np.count_nonzero(own)} triangles around "
-                f"({x:.3g}, {y:.3g}, {z:.3g}) m is inside out; recalculate them and export it again"
+                f"must have its normals outwards everywhere, but {where} is inside out; recalculate them and export it "
+                "again"
             )
     return None
 

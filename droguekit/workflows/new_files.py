@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.recipe.rigs import load_rig, read_rig_file, resolve_rig
+from datasets_manifest.recipe.rigs import read_rig_file, resolve_rig
 from drogue_models.presets import explain, parse_drogue
 
 # The face is as wide as leaves a margin of these many marker radii on either side of the markers.
@@ -153,12 +153,15 @@ def write_new_file(kind: Literal["drogue", "rig", "recipe"], out: Path, choices:
             parse_drogue(text, out.parent)
         except ValidationError as error:
             raise ValueError(f"new drogue: {explain(error)}") from error
+    elif kind == "rig":
+        table = read_rig_file(text, str(out))
+        if choices.calibration:
+            # As the command names them: the new file's folder may not be there yet.
+            table["calibration"] = [str(file) for file in choices.calibration]
+        resolve_rig(table)
     else:
         out.parent.mkdir(parents=True, exist_ok=True)  # files are named as seen from there
-        if kind == "rig":
-            resolve_rig(load_rig(read_rig_file(text, str(out)), out.parent))
-        else:
-            parse_recipe(text, out.parent)
+        parse_recipe(text, out.parent)
     write_text_atomic(out, text)
 
 

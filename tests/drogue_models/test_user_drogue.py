@@ -193,6 +193,11 @@ def disc(radius_m: float, z_m: float) -> trimesh.Trimesh:
     return mesh
 
 
+def doubled_sheet() -> trimesh.Trimesh:
+    corners_m = [[0.2, 0.0, 0.1], [0.2, 0.03, 0.1], [0.2, 0.0, 0.13]]
+    return trimesh.Trimesh(corners_m, [[0, 1, 2], [0, 2, 1]], process=False)
+
+
 def meshes_with(folder: Path, *pieces: trimesh.Trimesh) -> dict[int, trimesh.Trimesh]:
     trimesh.util.concatenate([tube(), *pieces]).export(folder / "body.ply")
     return drogue_meshes(load_drogue(write_toml(folder, RING + 'body_mesh = "body.ply"\n')))
@@ -205,6 +210,10 @@ def meshes_with(folder: Path, *pieces: trimesh.Trimesh) -> dict[int, trimesh.Tri
         (inside_out(ball(0.05, 0.2, 0.1)), r"the piece of 320 triangles around \(0\.2, .*, 0\.1\) m is inside out"),
         # Half of it sticks out of the tube.
         (inside_out(ball(0.05, 0.1, 0.4)), "is inside out"),
+        (
+            doubled_sheet(),
+            r"must enclose a volume, but the piece of 2 triangles around \(0\.2, .*, 0\.1\d*\) m does not",
+        ),
         # Neither a corner nor an edge of its triangles is over the face or the hub: only their inside is.
         (disc(0.329, 0.002), r"must lie behind the face, .* z = 0\.005 m, between 0\.21 and 0\.324 m"),
         (disc(0.2, 0.1), r"must lie behind the hub's face, z = 0\.25 m, within 0\.075 m"),

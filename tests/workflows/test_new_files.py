@@ -116,7 +116,7 @@ def test_a_new_rig_of_a_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["--calibration", "stereo.yaml", "--focal-px", "2000"], "--focal-px: the calibration has it; leave it out"),
         (["--calibration", "stereo.yaml", "--baseline", "0.2"], "--baseline: the calibration has it; leave it out"),
         (["--calibration-unit", "mm"], "--calibration-unit: is of --calibration, which is missing"),
-        (["--calibration", "nowhere.yaml"], "nowhere.yaml: there is no such calibration file"),
+        (["--calibration", "nowhere.yaml"], "rig: nowhere.yaml: there is no such calibration file"),
     ],
 )
 def test_options_beside_a_calibration_are_told(
@@ -128,9 +128,9 @@ def test_options_beside_a_calibration_are_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     storage(Path("stereo.yaml"), EVERYTHING)
-    assert run(["new", "rig", *options, "--out", "rig.toml"]) == WRONG_INPUT
+    assert run(["new", "rig", *options, "--out", "below/rig.toml"]) == WRONG_INPUT
     assert message in capsys.readouterr().err
-    assert not Path("rig.toml").exists()
+    assert not Path("below").exists()
 
 
 @pytest.mark.parametrize("drogue", ['red-8"\nseed = 5\n#', 'a"b', "a\\b"])
